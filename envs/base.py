@@ -1,0 +1,80 @@
+"""The environment interface, brax's, and the base of environments that are a MuJoCo model.
+
+An environment is two pure functions of one (unbatched) episode, as in `brax.envs.base.Env`:
+
+    reset(key) -> State                 s_0 ~ rho_0
+    step(state, action) -> State        s_{t+1}, r_t, done;  action in [-1, 1]^m
+
+`State` has the fields of brax's, so brax's wrappers and trainers take these environments; brax itself, slow to import,
+is not needed for them. Time limits are not the environment's business: `done` is termination only.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from flax import struct
+
+from envs.physics import compile_model, mjx_step
+
+ASSETS = Path(__file__).parent / "assets"
+
+
+@struct.dataclass
+class State:
+    """One environment after a reset or a step: the fields of `brax.envs.base.State`.
+
+    Attributes:
+      pipeline_state: what the next step needs of the physics, and no more (not all of `mjx.Data`).
+      obs: observation, `[observation_size]`.
+      reward: r_t of the step that led here, scalar; 0 after a reset.
+      done: 1.0 if that step ended in a terminal state, else 0.0.
+      metrics: scalars to look at, by name.
+      info: empty here; brax's wrappers keep their own values in it.
+    """
+
+    pipeline_state: Any
+    obs: jax.Array
+    reward: jax.Array
+    done: jax.Array
+    metrics: dict[str, jax.Array] = struct.field(default_factory=dict)
+    info: dict[str, Any] = struct.field(default_factory=dict)
+
+
+class MjxEnv:
+    """What environments over one MuJoCo model share; a subclass adds `reset` and `step`.
+
+    Args:
+      spec: the MuJoCo specification, already edited to the environment's options.
+      num_substeps: physics steps between two actions.
+    """
+
+    def __init__(self, spec: Any, num_substeps: int = 1):
+        self.model = compile_model(spec)
+        self.dt = self.model.opt.timestep * num_substeps
+        self.physics_step = mjx_step(self.model, num_substeps)
+
+    @property
+    def observation_size(self) -> int:
+        return jax.eval_shape(self.reset, jax.random.key(0)).obs.shape[-1]
+
+    @property
+    def action_size(self) -> int:
+        return self.model.nu
+
+    @property
+    def backend(self) -> str:
+        return "mjx"
+
+    @property
+    def unwrapped(self) -> MjxEnv:
+        return self
+
+
+def initial_state(pipeline_state: Any, obs: jax.Array, metric_names: tuple[str, ...] = ()) -> State:
+    """The State after a reset: nothing earned, nothing ended, all metrics 0."""
+    zero = jnp.zeros((), obs.dtype)
+    return State(pipeline_state, obs, reward=zero, done=zero, metrics={name: zero for name in metric_names})

@@ -1,0 +1,99 @@
+"""Swing up a torque-limited pendulum: Gymnasium's Pendulum-v1 as an MJX model.
+
+A uniform rod of mass m and length l turns about one end; theta = 0 is upright (m l^2 / 3 about the pivot):
+
+    theta'' = 3 g / (2 l) sin(theta) + 3 / (m l^2) tau,      |tau| <= torque_limit
+    r_t     = -(wrap(theta)^2 + 0.1 theta'^2 + 0.001 tau^2),  of the state and torque before the step
+
+Integrated by the semi-implicit Euler rule, with the speed clipped before the position is advanced. Never terminates;
+the time limit of 200 steps is a truncation. Best possible mean return about -137.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import jax
+import jax.numpy as jnp
+from flax import struct
+
+from envs.base import ASSETS, MjxEnv, State, initial_state
+from envs.options import option
+from envs.physics import load_spec
+
+
+@dataclass(frozen=True)
+class PendulumConfig:
+    """Options of the pendulum; the defaults are Gymnasium's."""
+
+    mass: float = option(1.0, "mass of the rod [kg]", above=0)
+    length: float = option(1.0, "length of the rod [m]", above=0)
+    gravity: float = option(10.0, "gravitational acceleration [m/s^2]", at_least=0)
+    torque_limit: float = option(2.0, "largest torque, reached at |action| = 1 [N m]", above=0)
+    speed_limit: float = option(8.0, "angular speed is clipped to this [rad/s]", above=0)
+    dt: float = option(0.05, "time between two actions, one physics step [s]", above=0, at_most=1)
+    episode_length: int = option(200, "steps until the time limit", at_least=1)
+
+
+@struct.dataclass
+class PendulumState:
+    """qpos `[1]`: angle from upright [rad]; qvel `[1]`: angular velocity [rad/s]."""
+
+    qpos: jax.Array
+    qvel: jax.Array
+
+
+class Pendulum(MjxEnv):
+    """The pendulum as an environment; see the module's docstring for its equations."""
+
+    def __init__(self, config: PendulumConfig = PendulumConfig()):
+        self.config = config
+        super().__init__(_spec(config))
+
+    def reset(self, rng: jax.Array) -> State:
+        """theta ~ U(-pi, pi), theta' ~ U(-1, 1)."""
+        key_angle, key_speed = jax.random.split(rng)
+        qpos = jax.random.uniform(key_angle, (1,), minval=-jnp.pi, maxval=jnp.pi)
+        qvel = jax.random.uniform(key_speed, (1,), minval=-1.0, maxval=1.0)
+        return initial_state(PendulumState(qpos, qvel), observe(qpos[0], qvel[0]))
+
+    def step(self, state: State, action: jax.Array) -> State:
+        """One step of `dt` under the torque `torque_limit * action`, the action clipped to [-1, 1]."""
+        config, before = self.config, state.pipeline_state
+        torque = config.torque_limit * jnp.clip(action, -1.0, 1.0)
+        _, qvel = self.physics_step(before.qpos, before.qvel, torque)
+        # MuJoCo has no limit on the speed of a joint: clip, then repeat the rule's last line, q' = q + dt v'.
+        qvel = jnp.clip(qvel, -config.speed_limit, config.speed_limit)
+        qpos = before.qpos + config.dt * qvel
+        return state.replace(
+            pipeline_state=PendulumState(qpos, qvel),
+            obs=observe(qpos[0], qvel[0]),
+            reward=reward(before.qpos[0], before.qvel[0], torque[0]),
+        )
+
+
+def observe(theta: jax.Array, theta_dot: jax.Array) -> jax.Array:
+    """(cos theta, sin theta, theta'), `[3]`."""
+    return jnp.stack([jnp.cos(theta), jnp.sin(theta), theta_dot])
+
+
+def reward(theta: jax.Array, theta_dot: jax.Array, torque: jax.Array) -> jax.Array:
+    """-(wrap(theta)^2 + 0.1 theta'^2 + 0.001 tau^2), with the angle wrapped to [-pi, pi)."""
+    wrapped = jnp.mod(theta + jnp.pi, 2 * jnp.pi) - jnp.pi
+    return -(wrapped**2 + 0.1 * theta_dot**2 + 0.001 * torque**2)
+
+
+def _spec(config: PendulumConfig):
+    """The MJCF with the options written into it: inertia follows mass and length, drawing follows length."""
+    spec = load_spec(ASSETS / "pendulum.xml")
+    spec.option.timestep = config.dt
+    spec.option.gravity = [0.0, 0.0, -config.gravity]
+    rod = spec.body("rod")
+    rod.mass = config.mass
+    rod.ipos = [0.0, 0.0, config.length / 2]
+    across = config.mass * config.length**2 / 12
+    rod.inertia = [across, across, 1e-4 * across]
+    spec.geom("rod").fromto = [0.0, 0.0, 0.0, 0.0, 0.0, config.length]
+    spec.site("tip").pos = [0.0, 0.0, config.length]
+    spec.actuator("torque").ctrlrange = [-config.torque_limit, config.torque_limit]
+    return spec

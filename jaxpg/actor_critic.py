@@ -1,0 +1,196 @@
+"""The actor-critic: rollout, advantage estimate and one gradient step as a pure `Algorithm`.
+
+REINFORCE and TD are the same program. They differ in one argument, the `Method`: how the steps are collected and what
+is made of them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import optax
+
+from jaxpg import estimators, normalization
+from jaxpg.distributions import gaussian_entropy, gaussian_sample, squashed_gaussian_log_prob
+from jaxpg.estimators import Estimate
+from jaxpg.losses import entropy_loss, policy_gradient_loss, value_loss
+from jaxpg.networks import Networks
+from jaxpg.rollout import PolicyFn, rollout
+from jaxpg.types import Algorithm, Metrics, PyTree, TrainState, Transition
+from jaxpg.vector_env import VectorEnv, VectorState
+
+
+class Method(NamedTuple):
+    """What REINFORCE and TD do differently.
+
+    Attributes:
+      collect: `collect(env, policy_fn, env_state, key) -> (env_state, Transition)`.
+      weight: `weight(transition) -> [T, N]`, 1 where a step counts.
+      estimate: `estimate(transition, weight, value, next_value) -> Estimate`, all `[T, N]`.
+    """
+
+    collect: Callable[[VectorEnv, PolicyFn, VectorState, jax.Array], tuple[VectorState, Transition]]
+    weight: Callable[[Transition], jax.Array]
+    estimate: Callable[[Transition, jax.Array, jax.Array, jax.Array], Estimate]
+
+
+def td(gamma: float, lambda_: float, num_steps: int) -> Method:
+    """Temporal differences: short rollouts that go on where the last one stopped, and bootstrap.
+
+    Termination sets the discount to 0. A time limit or the end of the rollout stops the lambda-sum and bootstraps
+    from the value of the true next observation.
+
+    Args:
+      gamma: discount, in [0, 1].
+      lambda_: 0 for the one-step TD error, 1 for Monte Carlo with a bootstrap at cuts.
+      num_steps: T, length of a rollout.
+    """
+
+    def collect(env, policy_fn, env_state, key):
+        return rollout(policy_fn, env.step, env_state, key, num_steps)
+
+    def estimate(transition, weight, value, next_value):
+        discount = gamma * (1 - transition.terminated)
+        continues = 1 - transition.truncated
+        return estimators.td_lambda(transition.reward, discount, value, next_value, lambda_ * continues)
+
+    return Method(collect, lambda transition: jnp.ones_like(transition.reward), estimate)
+
+
+BASELINES = ("none", "mean", "value")
+
+
+def reinforce(gamma: float, baseline: str) -> Method:
+    """REINFORCE: whole episodes from a fresh reset to the time limit, masked after termination; no bootstrap.
+
+    Args:
+      gamma: discount, in [0, 1].
+      baseline: one of `BASELINES`.
+    """
+
+    def collect(env, policy_fn, env_state, key):
+        key_reset, key_rollout = jax.random.split(key)
+        return rollout(policy_fn, env.step, env.reset(key_reset), key_rollout, env.episode_length)
+
+    def weight(transition):
+        """1 up to and with the step that ends the episode, 0 in the one that the reset began."""
+        ended = jnp.cumsum(transition.terminated, axis=0) - transition.terminated
+        return (ended == 0).astype(transition.reward.dtype)
+
+    def estimate(transition, weight, value, next_value):
+        reward = weight * transition.reward
+        discount = gamma * (1 - transition.terminated)
+        if baseline == "none":
+            return estimators.reinforce(reward, discount)
+        if baseline == "mean":
+            return estimators.reinforce_mean_baseline(reward, discount, weight)
+        return estimators.reinforce_value_baseline(reward, discount, value)
+
+    return Method(collect, weight, estimate)
+
+
+def actor_critic(
+    env: VectorEnv,
+    networks: Networks,
+    optimizer: optax.GradientTransformation,
+    method: Method,
+    *,
+    reward_scale: float = 1.0,
+    entropy_coef: float = 0.0,
+    normalize_observations: bool = True,
+    normalize_advantages: bool = True,
+) -> Algorithm:
+    """Policy-gradient training of an actor and a critic, one gradient step for each rollout.
+
+        L(theta, w) = -mean(log pi_theta(a_t | s_t) stop(A_t)) + 1/2 mean((V_w(s_t) - stop(target_t))^2)
+                      - entropy_coef mean(H_t)
+
+    Args:
+      env: N environments.
+      networks: policy and value; their parameters are apart, so the two losses may be added.
+      optimizer: of `{"actor": ..., "critic": ...}`.
+      method: `td(...)` or `reinforce(...)`.
+      reward_scale: factor on the rewards that the estimator and the critic see; reported returns are not scaled.
+      entropy_coef: weight of the entropy of u's Gaussian.
+      normalize_observations: feed the networks (s - mean) / std with running statistics, updated after each step.
+      normalize_advantages: mean 0 and standard deviation 1 over the batch.
+
+    Returns:
+      `Algorithm(init, step)`; metrics are scalars, of which `return_sum` and `episodes` are to be summed over updates
+      and the others averaged.
+    """
+
+    def init(key: jax.Array) -> TrainState:
+        key_params, key_env = jax.random.split(key)
+        params = networks.init(key_params)
+        return TrainState(
+            params=params,
+            opt_state=optimizer.init(params),
+            normalizer=normalization.init(env.observation_size),
+            env_state=env.reset(key_env),
+            update=jnp.zeros((), jnp.int32),
+        )
+
+    def loss_fn(params: PyTree, normalizer: PyTree, transition: Transition) -> tuple[jax.Array, Metrics]:
+        obs = normalization.normalize(normalizer, transition.obs)
+        next_obs = normalization.normalize(normalizer, transition.next_obs)
+        value = networks.value(params["critic"], obs)
+        next_value = networks.value(jax.lax.stop_gradient(params["critic"]), next_obs)
+        weight = method.weight(transition)
+        scaled = transition._replace(reward=reward_scale * transition.reward)
+        advantage, target = method.estimate(scaled, weight, value, next_value)
+        if normalize_advantages:
+            advantage = estimators.normalize_advantages(advantage, weight)
+        mean, log_std = networks.policy(params["actor"], obs)
+        log_prob = squashed_gaussian_log_prob(transition.pre_tanh, mean, log_std)
+        entropy = jnp.broadcast_to(gaussian_entropy(log_std), weight.shape)
+        losses = {
+            "policy_loss": policy_gradient_loss(log_prob, advantage, weight),
+            "value_loss": value_loss(value, target, weight),
+            "entropy": -entropy_loss(entropy, weight),
+        }
+        total = losses["policy_loss"] + losses["value_loss"] - entropy_coef * losses["entropy"]
+        return total, losses | {"sigma": jnp.mean(jnp.exp(log_std)), "value": jnp.mean(value)}
+
+    def step(state: TrainState, key: jax.Array) -> tuple[TrainState, Metrics]:
+        policy_fn = sampling_policy(networks, state.params, state.normalizer)
+        env_state, transition = method.collect(env, policy_fn, state.env_state, key)
+        gradients, losses = jax.grad(loss_fn, has_aux=True)(state.params, state.normalizer, transition)
+        updates, opt_state = optimizer.update(gradients, state.opt_state, state.params)
+        normalizer = state.normalizer
+        if normalize_observations:
+            normalizer = normalization.update(normalizer, transition.obs)
+        metrics = losses | {
+            "gradient_norm": optax.global_norm(gradients),
+            "return_sum": jnp.sum(transition.episode_return),
+            "episodes": jnp.sum(transition.terminated + transition.truncated),
+        }
+        params = optax.apply_updates(state.params, updates)
+        return TrainState(params, opt_state, normalizer, env_state, state.update + 1), metrics
+
+    return Algorithm(init, step)
+
+
+def sampling_policy(networks: Networks, params: PyTree, normalizer: PyTree) -> PolicyFn:
+    """`policy_fn(obs, key) -> u`, drawn from the Gaussian."""
+
+    def policy_fn(obs, key):
+        mean, log_std = networks.policy(params["actor"], normalization.normalize(normalizer, obs))
+        return gaussian_sample(key, mean, log_std)
+
+    return policy_fn
+
+
+def deterministic_policy(
+    networks: Networks, params: PyTree, normalizer: PyTree
+) -> Callable[[jax.Array], jax.Array]:
+    """`policy(obs) -> action` in [-1, 1]: tanh of the Gaussian's mean."""
+
+    def policy(obs):
+        mean, _ = networks.policy(params["actor"], normalization.normalize(normalizer, obs))
+        return jnp.tanh(mean)
+
+    return policy

@@ -1,0 +1,194 @@
+"""The ladder of policy-gradient estimators, side by side.
+
+All estimate the same gradient, by the same sum with a different advantage:
+
+    grad J(theta) ~ mean over trajectories of  sum_t  grad log pi_theta(a_t | s_t)  A_t
+
+| function                  | A_t                              | bias        | variance | target of the critic |
+|---------------------------|----------------------------------|-------------|----------|----------------------|
+| `reinforce`               | G_t                              | none        | highest  | G_t                  |
+| `reinforce_mean_baseline` | G_t - mean G                     | factor 1-1/N| lower    | G_t                  |
+| `reinforce_value_baseline`| G_t - V(s_t)                     | none        | lower    | G_t                  |
+| `td_lambda`               | G_t^lambda - V(s_t)  (GAE)       | critic's    | between  | G_t^lambda           |
+| `td_zero`                 | r_t + gamma V(s_{t+1}) - V(s_t)  | the critic's| lowest   | A_t + V(s_t)         |
+
+"None" is with respect to the gradient that leaves out the factor gamma^t, as the lesson's section 3 does; it is the
+gradient of J itself at gamma = 1. Arrays have time first, `[T, ...]`; discounts are as in `jaxpg.returns`.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from jaxpg.returns import discounted_returns, lambda_returns, td_errors
+
+
+class Estimate(NamedTuple):
+    """What one estimator makes of a trajectory.
+
+    Attributes:
+      advantage: A_t, the factor of the score grad log pi(a_t | s_t), `[T, ...]`.
+      target: what the critic's V(s_t) is regressed to, `[T, ...]`.
+    """
+
+    advantage: jax.Array
+    target: jax.Array
+
+
+def reinforce(reward: jax.Array, discount: jax.Array | float) -> Estimate:
+    """REINFORCE without a baseline, from complete episodes.
+
+        A_t = G_t = r_t + d_t G_{t+1},    G_T = 0
+
+    Args:
+      reward: r_t, `[T, ...]`, 0 after the end of an episode.
+      discount: d_t, `[T, ...]` or a scalar.
+
+    Raises:
+      ValueError: an array's shape does not fit the rewards'.
+
+    Source: the lesson, section 3; Williams, Machine Learning 8 (1992).
+
+    >>> reinforce(jnp.array([1.0, 2.0]), 1.0).advantage.tolist()
+    [3.0, 2.0]
+    """
+    returns = discounted_returns(reward, discount, 0.0)
+    return Estimate(returns, returns)
+
+
+def reinforce_mean_baseline(
+    reward: jax.Array, discount: jax.Array | float, weight: jax.Array | float = 1.0
+) -> Estimate:
+    """REINFORCE with the mean return of the batch as baseline.
+
+        A_t = G_t - b,    b = sum_{t,i} w_{t,i} G_{t,i} / sum_{t,i} w_{t,i}
+
+    The mean contains the sample itself, which shrinks the expected gradient by about 1 - 1/N for N trajectories.
+
+    Args:
+      reward: r_t, `[T, ...]`, 0 after the end of an episode.
+      discount: d_t, `[T, ...]` or a scalar.
+      weight: 1 where the step belongs to the episode and 0 after its end, `[T, ...]` or a scalar.
+
+    Raises:
+      ValueError: an array's shape does not fit the rewards'.
+
+    Source: the lesson, section 3.1 (a baseline that is the same for every state).
+
+    >>> reinforce_mean_baseline(jnp.array([1.0, 2.0]), 1.0).advantage.tolist()
+    [0.5, -0.5]
+    """
+    returns = discounted_returns(reward, discount, 0.0)
+    weight = jnp.broadcast_to(weight, returns.shape)
+    return Estimate(returns - jnp.sum(weight * returns) / jnp.sum(weight), returns)
+
+
+def reinforce_value_baseline(reward: jax.Array, discount: jax.Array | float, value: jax.Array) -> Estimate:
+    """REINFORCE with a learned value function as baseline: Monte Carlo minus value.
+
+        A_t = G_t - V(s_t)
+
+    Args:
+      reward: r_t, `[T, ...]`, 0 after the end of an episode.
+      discount: d_t, `[T, ...]` or a scalar.
+      value: V(s_t), `[T, ...]`.
+
+    Raises:
+      ValueError: an array's shape does not fit the rewards'.
+
+    Source: the lesson, section 3.1.
+
+    >>> reinforce_value_baseline(jnp.array([1.0, 2.0]), 1.0, jnp.array([2.0, 2.0])).advantage.tolist()
+    [1.0, 0.0]
+    """
+    returns = discounted_returns(reward, discount, 0.0)
+    if value.shape != returns.shape:
+        raise ValueError(f"value has shape {value.shape}, expected {returns.shape}")
+    return Estimate(returns - value, returns)
+
+
+def td_zero(
+    reward: jax.Array, discount: jax.Array | float, value: jax.Array, next_value: jax.Array
+) -> Estimate:
+    """The one-step TD error as advantage, TD(0).
+
+        A_t = delta_t = r_t + d_t V(s_{t+1}) - V(s_t)
+
+    Args:
+      reward: r_t, `[T, ...]`.
+      discount: d_t, `[T, ...]` or a scalar; 0 where s_{t+1} is terminal.
+      value: V(s_t), `[T, ...]`.
+      next_value: V of the true s_{t+1}, `[T, ...]`.
+
+    Raises:
+      ValueError: an array's shape does not fit the rewards'.
+
+    Source: the lesson, section 4.1.
+
+    >>> td_zero(jnp.array([1.0]), 0.5, jnp.array([2.0]), jnp.array([4.0])).target.tolist()
+    [3.0]
+    """
+    advantage = td_errors(reward, discount, value, next_value)
+    return Estimate(advantage, advantage + value)
+
+
+def td_lambda(
+    reward: jax.Array,
+    discount: jax.Array | float,
+    value: jax.Array,
+    next_value: jax.Array,
+    lambda_: jax.Array | float,
+) -> Estimate:
+    """TD(lambda), the generalized advantage estimate (GAE).
+
+        A_t = G_t^lambda - V(s_t) = delta_t + d_t lambda_t A_{t+1}
+
+    lambda = 0 is `td_zero`; lambda = 1 is Monte Carlo minus value, with a bootstrap at cuts.
+
+    Args:
+      reward: r_t, `[T, ...]`.
+      discount: d_t, `[T, ...]` or a scalar; 0 where s_{t+1} is terminal.
+      value: V(s_t), `[T, ...]`.
+      next_value: V of the true s_{t+1}, `[T, ...]`.
+      lambda_: lambda_t in [0, 1], 0 at a cut, `[T, ...]` or a scalar.
+
+    Raises:
+      ValueError: an array's shape does not fit the rewards'.
+
+    Source: Schulman et al., arXiv 1506.02438, equation 16.
+
+    >>> td_lambda(jnp.array([1.0, 1.0]), 1.0, jnp.array([0.0, 1.0]), jnp.array([1.0, 2.0]), 1.0).advantage.tolist()
+    [4.0, 2.0]
+    """
+    if value.shape != reward.shape:
+        raise ValueError(f"value has shape {value.shape}, expected {reward.shape}")
+    returns = lambda_returns(reward, discount, next_value, lambda_)
+    return Estimate(returns - value, returns)
+
+
+def normalize_advantages(
+    advantage: jax.Array, weight: jax.Array | float = 1.0, epsilon: float = 1e-8
+) -> jax.Array:
+    """Advantages with mean 0 and standard deviation 1 over the whole batch.
+
+        A'_t = (A_t - mean A) / (std A + epsilon),    with weighted mean and variance
+
+    Args:
+      advantage: A_t, `[T, ...]`.
+      weight: 1 where the step counts, else 0, `[T, ...]` or a scalar. Entries of weight 0 are shifted too, and
+        must be masked again by the loss.
+      epsilon: keeps a constant batch at 0.
+
+    Source: practice; not part of the theorem. It rescales the step, and like every mean over the batch it
+    includes the sample itself.
+
+    >>> normalize_advantages(jnp.array([1.0, 3.0])).round(4).tolist()
+    [-1.0, 1.0]
+    """
+    weight = jnp.broadcast_to(weight, advantage.shape)
+    total = jnp.sum(weight)
+    centred = advantage - jnp.sum(weight * advantage) / total
+    return centred / (jnp.sqrt(jnp.sum(weight * centred**2) / total) + epsilon)

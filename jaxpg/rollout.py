@@ -1,0 +1,42 @@
+"""Acting in the environments for some steps, as one scan."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+
+from jaxpg.types import Transition
+
+# obs [N, observation_size], key -> u [N, action_size]
+PolicyFn = Callable[[jax.Array, jax.Array], jax.Array]
+
+
+def rollout(
+    policy_fn: PolicyFn, env_step: Callable, env_state: Any, key: jax.Array, length: int
+) -> tuple[Any, Transition]:
+    """`length` steps of all environments under one policy.
+
+        u_t ~ policy_fn(s_t),    s_{t+1}, r_t ~ env_step(s_t, tanh(u_t))
+
+    Args:
+      policy_fn: `policy_fn(obs, key) -> u`, the action before squashing.
+      env_step: `VectorEnv.step`.
+      env_state: where to start.
+      key: random key of the whole rollout.
+      length: T, at least 1.
+
+    Returns:
+      The environments after the last step, and the `Transition`, each field `[T, N, ...]`.
+    """
+
+    def step(env_state, key):
+        key_policy, key_env = jax.random.split(key)
+        obs = env_state.env.obs
+        pre_tanh = policy_fn(obs, key_policy)
+        env_state, outcome = env_step(env_state, jnp.tanh(pre_tanh), key_env)
+        return env_state, Transition(obs=obs, pre_tanh=pre_tanh, **outcome._asdict())
+
+    return jax.lax.scan(step, env_state, jax.random.split(key, length))

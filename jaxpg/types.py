@@ -1,0 +1,63 @@
+"""The values that pass between the parts, with their shapes: T steps, N environments, time first."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax
+
+PyTree = Any
+Metrics = dict[str, jax.Array]
+
+
+class Transition(NamedTuple):
+    """T steps of N environments.
+
+    Attributes:
+      obs: s_t, `[T, N, observation_size]`.
+      pre_tanh: u_t, the action before squashing, `[T, N, action_size]`; the environment took tanh(u_t).
+      reward: r_t, `[T, N]`.
+      terminated: 1.0 where the step ended in a terminal state, whose value is 0, `[T, N]`.
+      truncated: 1.0 where a time limit cut the episode after the step, `[T, N]`; never together with `terminated`.
+      next_obs: the true s_{t+1}, the one before any reset, `[T, N, observation_size]`.
+      episode_return: undiscounted return of the episode that ended with the step, 0 where none did, `[T, N]`.
+    """
+
+    obs: jax.Array
+    pre_tanh: jax.Array
+    reward: jax.Array
+    terminated: jax.Array
+    truncated: jax.Array
+    next_obs: jax.Array
+    episode_return: jax.Array
+
+
+class TrainState(NamedTuple):
+    """Everything that the next update needs; a checkpoint holds all of it.
+
+    Attributes:
+      params: the networks' parameters, `{"actor": ..., "critic": ...}`.
+      opt_state: the optimizer's state.
+      normalizer: running statistics of the observations.
+      env_state: the N environments.
+      update: number of updates made, int32 scalar.
+    """
+
+    params: PyTree
+    opt_state: PyTree
+    normalizer: PyTree
+    env_state: PyTree
+    update: jax.Array
+
+
+class Algorithm(NamedTuple):
+    """A learning algorithm as a state machine of pure functions.
+
+    Attributes:
+      init: `init(key) -> TrainState`.
+      step: `step(state, key) -> (state, metrics)`, one update; metrics are scalars by name.
+    """
+
+    init: Callable[[jax.Array], TrainState]
+    step: Callable[[TrainState, jax.Array], tuple[TrainState, Metrics]]

@@ -1,0 +1,92 @@
+"""Many environments side by side: time limit, resets, and the true next observation.
+
+The environment is any object with brax's `reset(key) -> State` and `step(State, action) -> State`. Its `done` means
+termination; the time limit is added here, as truncation. An environment that ended is reset at once with a fresh draw,
+and the observation from *before* the reset is handed out as s_{t+1}, for the bootstrap.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+
+class VectorState(NamedTuple):
+    """N running episodes.
+
+    Attributes:
+      env: the environment's own State, every leaf with a leading axis `[N, ...]`.
+      time: steps since the last reset, `[N]` int32.
+      episode_return: undiscounted return since the last reset, `[N]`.
+    """
+
+    env: Any
+    time: jax.Array
+    episode_return: jax.Array
+
+
+class Outcome(NamedTuple):
+    """What one step of all environments brought; fields as in `jaxpg.types.Transition`, without the time axis."""
+
+    reward: jax.Array
+    terminated: jax.Array
+    truncated: jax.Array
+    next_obs: jax.Array
+    episode_return: jax.Array
+
+
+class VectorEnv(NamedTuple):
+    """N environments as two pure functions.
+
+    Attributes:
+      reset: `reset(key) -> VectorState`.
+      step: `step(state, action[N, m], key) -> (state, Outcome)`; actions in [-1, 1].
+      observation_size, action_size, num_envs, episode_length: sizes.
+    """
+
+    reset: Callable[[jax.Array], VectorState]
+    step: Callable[[VectorState, jax.Array, jax.Array], tuple[VectorState, Outcome]]
+    observation_size: int
+    action_size: int
+    num_envs: int
+    episode_length: int
+
+
+def vectorize(env: Any, num_envs: int, episode_length: int) -> VectorEnv:
+    """`num_envs` copies of `env`, each ended after `episode_length` steps at the latest and then reset.
+
+    Args:
+      env: brax-shaped environment with an array as observation.
+      num_envs: N, at least 1.
+      episode_length: steps until the time limit, at least 1.
+    """
+
+    def reset(key):
+        state = jax.vmap(env.reset)(jax.random.split(key, num_envs))
+        return VectorState(state, jnp.zeros(num_envs, jnp.int32), jnp.zeros(num_envs, state.reward.dtype))
+
+    def step(state, action, key):
+        env_state = jax.vmap(env.step)(state.env, action)
+        time = state.time + 1
+        episode_return = state.episode_return + env_state.reward
+        terminated = env_state.done.astype(env_state.reward.dtype)
+        truncated = (time >= episode_length) * (1 - terminated)
+        done = (terminated + truncated) > 0
+        outcome = Outcome(env_state.reward, terminated, truncated, env_state.obs, jnp.where(done, episode_return, 0))
+        running = VectorState(env_state, time, episode_return)
+        # Drawing and observing new states costs as much as a step in some environments: only where one has ended.
+        return jax.lax.cond(jnp.any(done), lambda: _select(done, reset(key), running), lambda: running), outcome
+
+    return VectorEnv(reset, step, env.observation_size, env.action_size, num_envs, episode_length)
+
+
+def _select(mask: jax.Array, if_true: Any, if_false: Any) -> Any:
+    """Leaf by leaf along the leading axis: `if_true` where the mask holds."""
+
+    def select(a, b):
+        return jnp.where(mask.reshape(mask.shape + (1,) * (b.ndim - 1)), a, b)
+
+    return jax.tree.map(select, if_true, if_false)
