@@ -62,6 +62,12 @@ class ArmConfig:
             )
 
 
+TRAINING = {
+    "td": {"num_envs": 128, "num_steps": 16, "total_steps": 12_000_000, "algo.gamma": 0.9},
+    "reinforce": {"num_envs": 128, "total_steps": 12_000_000, "algo.gamma": 0.9},
+}
+
+
 @struct.dataclass
 class ArmState:
     """qpos `[2]`: joint angles [rad]; qvel `[2]`: joint velocities [rad/s]; goal `[2]`: its position [m]."""

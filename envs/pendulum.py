@@ -35,6 +35,25 @@ class PendulumConfig:
     episode_length: int = option(200, "steps until the time limit", at_least=1)
 
 
+TRAINING = {
+    "td": {
+        "num_envs": 64,
+        "num_steps": 10,
+        "total_steps": 3_000_000,
+        "algo.gamma": 0.97,
+        "algo.reward_scale": 0.1,
+        "network.sigma": 0.6,
+    },
+    "reinforce": {
+        "num_envs": 64,
+        "total_steps": 10_000_000,
+        "algo.gamma": 0.97,
+        "algo.reward_scale": 0.1,
+        "network.sigma": 0.6,
+    },
+}
+
+
 @struct.dataclass
 class PendulumState:
     """qpos `[1]`: angle from upright [rad]; qvel `[1]`: angular velocity [rad/s]."""

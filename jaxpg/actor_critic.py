@@ -20,18 +20,20 @@ from jaxpg.losses import entropy_loss, policy_gradient_loss, value_loss
 from jaxpg.networks import Networks
 from jaxpg.rollout import PolicyFn, rollout
 from jaxpg.types import Algorithm, Metrics, PyTree, TrainState, Transition
-from jaxpg.vector_env import VectorEnv, VectorState
+from jaxpg.vector_env import VectorEnv, VectorState, stagger
 
 
 class Method(NamedTuple):
     """What REINFORCE and TD do differently.
 
     Attributes:
+      start: `start(env, key) -> env_state`, the environments before the first update.
       collect: `collect(env, policy_fn, env_state, key) -> (env_state, Transition)`.
       weight: `weight(transition) -> [T, N]`, 1 where a step counts.
       estimate: `estimate(transition, weight, value, next_value) -> Estimate`, all `[T, N]`.
     """
 
+    start: Callable[[VectorEnv, jax.Array], VectorState]
     collect: Callable[[VectorEnv, PolicyFn, VectorState, jax.Array], tuple[VectorState, Transition]]
     weight: Callable[[Transition], jax.Array]
     estimate: Callable[[Transition, jax.Array, jax.Array, jax.Array], Estimate]
@@ -49,6 +51,10 @@ def td(gamma: float, lambda_: float, num_steps: int) -> Method:
       num_steps: T, length of a rollout.
     """
 
+    def start(env, key):
+        key_reset, key_stagger = jax.random.split(key)
+        return stagger(env.reset(key_reset), key_stagger, env.episode_length)
+
     def collect(env, policy_fn, env_state, key):
         return rollout(policy_fn, env.step, env_state, key, num_steps)
 
@@ -57,7 +63,7 @@ def td(gamma: float, lambda_: float, num_steps: int) -> Method:
         continues = 1 - transition.truncated
         return estimators.td_lambda(transition.reward, discount, value, next_value, lambda_ * continues)
 
-    return Method(collect, lambda transition: jnp.ones_like(transition.reward), estimate)
+    return Method(start, collect, lambda transition: jnp.ones_like(transition.reward), estimate)
 
 
 BASELINES = ("none", "mean", "value")
@@ -89,7 +95,7 @@ def reinforce(gamma: float, baseline: str) -> Method:
             return estimators.reinforce_mean_baseline(reward, discount, weight)
         return estimators.reinforce_value_baseline(reward, discount, value)
 
-    return Method(collect, weight, estimate)
+    return Method(lambda env, key: env.reset(key), collect, weight, estimate)
 
 
 def actor_critic(
@@ -130,7 +136,7 @@ def actor_critic(
             params=params,
             opt_state=optimizer.init(params),
             normalizer=normalization.init(env.observation_size),
-            env_state=env.reset(key_env),
+            env_state=method.start(env, key_env),
             update=jnp.zeros((), jnp.int32),
         )
 
@@ -166,7 +172,7 @@ def actor_critic(
         metrics = losses | {
             "gradient_norm": optax.global_norm(gradients),
             "return_sum": jnp.sum(transition.episode_return),
-            "episodes": jnp.sum(transition.terminated + transition.truncated),
+            "episodes": jnp.sum(transition.episode_end),
         }
         params = optax.apply_updates(state.params, updates)
         return TrainState(params, opt_state, normalizer, env_state, state.update + 1), metrics

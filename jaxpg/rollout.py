@@ -34,7 +34,7 @@ def rollout(
 
     def step(env_state, key):
         key_policy, key_env = jax.random.split(key)
-        obs = env_state.env.obs
+        obs = env_state.obs
         pre_tanh = policy_fn(obs, key_policy)
         env_state, outcome = env_step(env_state, jnp.tanh(pre_tanh), key_env)
         return env_state, Transition(obs=obs, pre_tanh=pre_tanh, **outcome._asdict())

@@ -21,7 +21,8 @@ class Transition(NamedTuple):
       terminated: 1.0 where the step ended in a terminal state, whose value is 0, `[T, N]`.
       truncated: 1.0 where a time limit cut the episode after the step, `[T, N]`; never together with `terminated`.
       next_obs: the true s_{t+1}, the one before any reset, `[T, N, observation_size]`.
-      episode_return: undiscounted return of the episode that ended with the step, 0 where none did, `[T, N]`.
+      episode_end: 1.0 where a whole episode, played from its first step, ended with the step, `[T, N]`.
+      episode_return: the undiscounted return of that episode, 0 where none ended, `[T, N]`.
     """
 
     obs: jax.Array
@@ -30,6 +31,7 @@ class Transition(NamedTuple):
     terminated: jax.Array
     truncated: jax.Array
     next_obs: jax.Array
+    episode_end: jax.Array
     episode_return: jax.Array
 
 

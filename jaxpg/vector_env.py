@@ -21,11 +21,18 @@ class VectorState(NamedTuple):
       env: the environment's own State, every leaf with a leading axis `[N, ...]`.
       time: steps since the last reset, `[N]` int32.
       episode_return: undiscounted return since the last reset, `[N]`.
+      whole: 1.0 where the episode is played from its first step, `[N]`; see `stagger`.
     """
 
     env: Any
     time: jax.Array
     episode_return: jax.Array
+    whole: jax.Array
+
+    @property
+    def obs(self) -> jax.Array:
+        """s_t, `[N, observation_size]`."""
+        return self.env.obs
 
 
 class Outcome(NamedTuple):
@@ -35,6 +42,7 @@ class Outcome(NamedTuple):
     terminated: jax.Array
     truncated: jax.Array
     next_obs: jax.Array
+    episode_end: jax.Array
     episode_return: jax.Array
 
 
@@ -66,7 +74,8 @@ def vectorize(env: Any, num_envs: int, episode_length: int) -> VectorEnv:
 
     def reset(key):
         state = jax.vmap(env.reset)(jax.random.split(key, num_envs))
-        return VectorState(state, jnp.zeros(num_envs, jnp.int32), jnp.zeros(num_envs, state.reward.dtype))
+        zeros = jnp.zeros_like(state.reward)
+        return VectorState(state, zeros.astype(jnp.int32), episode_return=zeros, whole=zeros + 1)
 
     def step(state, action, key):
         env_state = jax.vmap(env.step)(state.env, action)
@@ -75,12 +84,25 @@ def vectorize(env: Any, num_envs: int, episode_length: int) -> VectorEnv:
         terminated = env_state.done.astype(env_state.reward.dtype)
         truncated = (time >= episode_length) * (1 - terminated)
         done = (terminated + truncated) > 0
-        outcome = Outcome(env_state.reward, terminated, truncated, env_state.obs, jnp.where(done, episode_return, 0))
-        running = VectorState(env_state, time, episode_return)
+        episode_end = done * state.whole
+        outcome = Outcome(
+            env_state.reward, terminated, truncated, env_state.obs, episode_end, episode_end * episode_return
+        )
+        running = VectorState(env_state, time, episode_return, state.whole)
         # Drawing and observing new states costs as much as a step in some environments: only where one has ended.
         return jax.lax.cond(jnp.any(done), lambda: _select(done, reset(key), running), lambda: running), outcome
 
     return VectorEnv(reset, step, env.observation_size, env.action_size, num_envs, episode_length)
+
+
+def stagger(state: VectorState, key: jax.Array, episode_length: int) -> VectorState:
+    """Fresh episodes moved to random points of their time limit: t_i ~ U{0, ..., episode_length - 1}.
+
+    Without it all environments reach the time limit together for ever, and a short rollout sees one phase of the
+    episode only. The shortened first episodes are not counted as episodes.
+    """
+    time = jax.random.randint(key, state.time.shape, 0, episode_length)
+    return state._replace(time=time, whole=(time == 0).astype(state.whole.dtype))
 
 
 def _select(mask: jax.Array, if_true: Any, if_false: Any) -> Any:

@@ -1,0 +1,45 @@
+"""brax's own environments, by their names: `make("brax", name="inverted_pendulum")`.
+
+They are handed on as they are: brax's State is what this project's environments return too. They carry all of brax's
+pipeline state, and are as fast as brax is on a CPU.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import warnings
+from dataclasses import dataclass
+from typing import Any
+
+from envs.options import OptionError, option, unknown
+
+TRAINING = {
+    "td": {"num_envs": 64, "num_steps": 16, "total_steps": 2_000_000, "algo.gamma": 0.99},
+    "reinforce": {"num_envs": 16, "total_steps": 2_000_000, "algo.gamma": 0.99},
+}
+
+
+@dataclass(frozen=True)
+class BraxConfig:
+    """Options of a brax environment."""
+
+    name: str = option("inverted_pendulum", "brax's name of the environment")
+    backend: str = option("mjx", "brax's physics", choices=("mjx", "generalized", "positional", "spring"))
+    episode_length: int = option(1000, "steps until the time limit", at_least=1)
+
+
+def make(config: BraxConfig) -> Any:
+    """The brax environment; raises OptionError with the nearest name where brax has none of that name."""
+    # brax says at every import that it is no longer maintained, and MJX that it has no Warp: neither helps here.
+    with warnings.catch_warnings(), contextlib.redirect_stdout(io.StringIO()):
+        warnings.simplefilter("ignore")
+        from brax import envs
+
+        try:
+            return envs.get_environment(config.name, backend=config.backend)
+        except KeyError:
+            pass
+    known = ("ant", "fast", "halfcheetah", "hopper", "humanoid", "humanoidstandup", "inverted_pendulum")
+    known += ("inverted_double_pendulum", "pusher", "reacher", "swimmer", "walker2d")
+    raise OptionError([unknown("brax environment", config.name, known)])

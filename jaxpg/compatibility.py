@@ -1,0 +1,30 @@
+"""Which jaxlib releases this project may compute with."""
+
+from __future__ import annotations
+
+# Releases whose CPU reductions are wrong: jit(lambda a: jnp.sum(jnp.broadcast_to(a, (2, 1024, 1024)))) of ones differs
+# from 2097152 in about half of the calls. `tests/test_compatibility.py` reproduces it where one of them is installed.
+WRONG_SUMS = ("0.10.2",)
+# Releases that wait for ever when batched LAPACK calls fill XLA's thread pool; the last one is 0.11.0. The shipped
+# environments make no such calls; brax's do.
+LAST_DEADLOCK = (0, 11, 0)
+
+
+def check_jaxlib(version: str) -> None:
+    """Raises ImportError if `version` of jaxlib is known to compute wrong numbers on a CPU.
+
+    >>> check_jaxlib("0.10.1")
+    """
+    if version in WRONG_SUMS:
+        raise ImportError(
+            f"jaxlib {version} computes wrong sums on a CPU; install another one, such as: pip install 'jax==0.10.1'"
+        )
+
+
+def may_deadlock(version: str) -> bool:
+    """Whether this jaxlib can hang in concurrent batched LAPACK calls, unless it has one thread.
+
+    >>> may_deadlock("0.10.1"), may_deadlock("0.11.1")
+    (True, False)
+    """
+    return tuple(int(part) for part in version.split(".")[:3]) <= LAST_DEADLOCK

@@ -1,0 +1,289 @@
+"""What a training run is told: typed options in groups, composed by Hydra, checked here.
+
+The command line is Hydra's: `env=arm algo=td algo.lambda_=0.9 seed=3`. Hydra composes the groups and reads the values;
+names, types and ranges come from dataclasses of `envs.options.option` fields, so that every mistake is reported at once
+and in the user's words. Values that nobody gave come from the environment's registry entry, which keeps what was tuned
+on it, and else from the dataclasses.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import envs
+from envs.options import OptionError, build, describe_range, option, unknown
+from jaxpg.actor_critic import BASELINES
+from jaxpg.networks import ACTIVATIONS
+from jaxpg.run.errors import UserError
+
+
+@dataclass(frozen=True)
+class Learning:
+    """Options that TD and REINFORCE share."""
+
+    gamma: float = option(0.99, "discount", at_least=0, at_most=1)
+    actor_lr: float = option(0.002, "Adam step size of the actor", above=0)
+    critic_lr: float = option(0.004, "Adam step size of the critic", above=0)
+    final_lr: float = option(0.1, "step sizes fall linearly to this fraction", at_least=0, at_most=1)
+    max_gradient_norm: float = option(1.0, "longer gradients are shortened to this", above=0)
+    reward_scale: float = option(1.0, "factor on the rewards that are learned from", above=0)
+    entropy_coef: float = option(0.0, "weight of the entropy bonus", at_least=0)
+    normalize_advantages: bool = option(True, "advantages with mean 0 and deviation 1 over the batch")
+    normalize_observations: bool = option(True, "observations with running mean 0 and deviation 1")
+
+
+@dataclass(frozen=True)
+class TD(Learning):
+    """Temporal differences: TD(lambda) actor-critic; lambda_=0 is the one-step TD error."""
+
+    lambda_: float = option(0.95, "weight of longer returns: 0 is TD(0), 1 Monte Carlo", at_least=0, at_most=1)
+
+
+@dataclass(frozen=True)
+class Reinforce(Learning):
+    """REINFORCE: complete episodes, Monte Carlo returns."""
+
+    baseline: str = option("value", "what is subtracted from the return", choices=BASELINES)
+
+
+@dataclass(frozen=True)
+class MLP:
+    """Separate multilayer perceptrons for actor and critic."""
+
+    widths: list[int] = option([64, 64], "hidden units by layer", at_least=1)
+    activation: str = option("tanh", "activation of the hidden layers", choices=tuple(ACTIVATIONS))
+    sigma: float = option(0.5, "initial standard deviation of the policy, before tanh", above=0)
+    learn_sigma: bool = option(True, "learn the standard deviation")
+
+
+@dataclass(frozen=True)
+class Run:
+    """Options of the run itself."""
+
+    seed: int = option(0, "random seed", at_least=0, at_most=2**32 - 1)
+    num_seeds: int = option(1, "agents trained at once, with seeds seed, seed + 1, ...", at_least=1)
+    num_envs: int = option(64, "environments of each agent", at_least=1)
+    num_steps: int | None = option(None, "steps of a rollout (td); reinforce plays whole episodes", at_least=1)
+    total_steps: int = option(1_000_000, "environment steps to train for, of each agent", at_least=1)
+    log_interval: int = option(50_000, "environment steps between two lines of metrics", at_least=1)
+    eval_interval: int = option(250_000, "environment steps between two evaluations", at_least=1)
+    eval_episodes: int = option(128, "episodes of an evaluation", at_least=1)
+    checkpoint_interval: int = option(1_000_000, "environment steps between two checkpoints", at_least=1)
+    run_dir: str | None = option(None, "run folder [default: runs/<env>-<algo>-s<seed>-<time>]")
+
+
+GROUPS: dict[str, dict[str, type]] = {
+    "env": {name: entry.config for name, entry in envs.REGISTRY.items()},
+    "algo": {"td": TD, "reinforce": Reinforce},
+    "network": {"mlp": MLP},
+}
+DEFAULT_CHOICES = {"env": "pendulum", "algo": "td", "network": "mlp"}
+DEFAULT_ROLLOUT = 16  # steps of a TD rollout where neither the user nor the environment says
+
+
+@dataclass(frozen=True)
+class Config:
+    """A checked configuration: which member of each group, its options, and the run's.
+
+    Attributes:
+      choices: group -> member, such as `{"env": "pendulum", "algo": "td", "network": "mlp"}`.
+      env, algo, network: the members' options, dataclasses of `GROUPS`.
+      run: the run's own options.
+    """
+
+    choices: Mapping[str, str]
+    env: Any
+    algo: Any
+    network: Any
+    run: Run
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain nested values, as written to `config.yaml`; `from_dict` is its inverse."""
+        groups = {
+            group: {"id": choice, **dataclasses.asdict(getattr(self, group))} for group, choice in self.choices.items()
+        }
+        return groups | dataclasses.asdict(self.run)
+
+
+def from_dict(values: Mapping[str, Any]) -> Config:
+    """The configuration in plain nested values, once everything in it has been checked.
+
+    Raises:
+      OptionError: lists every unknown name, wrong type and value out of range.
+    """
+    choices = {group: values[group]["id"] for group in GROUPS}
+    problems, parts = [], {}
+    rest = {name: value for name, value in values.items() if name not in GROUPS}
+    sections = [(group, GROUPS[group][choices[group]], dict(values[group])) for group in GROUPS] + [("", Run, rest)]
+    for name, schema, options in sections:
+        options.pop("id", None)
+        try:
+            parts[name or "run"] = build(schema, options, prefix=f"{name}." if name else "")
+        except OptionError as error:
+            problems += error.problems
+    if problems:
+        raise OptionError(problems)
+    return _complete(Config(choices, **parts))
+
+
+def _complete(config: Config) -> Config:
+    """The rollout length filled in, which depends on algorithm and environment."""
+    given, horizon = config.run.num_steps, config.env.episode_length
+    if config.choices["algo"] == "reinforce":
+        if given not in (None, horizon):
+            raise OptionError([f"num_steps={given}: algo=reinforce plays whole episodes, {horizon} steps here; leave it out"])
+        given = horizon
+    if config.run.num_seeds + config.run.seed > 2**32:
+        raise OptionError([f"seed={config.run.seed} num_seeds={config.run.num_seeds}: seeds must stay below 2**32"])
+    return dataclasses.replace(config, run=dataclasses.replace(config.run, num_steps=given or DEFAULT_ROLLOUT))
+
+
+def compose(arguments: Sequence[str]) -> Config:
+    """The configuration that a command line asks for.
+
+    Args:
+      arguments: Hydra overrides, `name=value`.
+
+    Raises:
+      OptionError, UserError: every unknown name, wrong type and value out of range; or text that is no override.
+    """
+    given = parse(arguments)
+    choices = DEFAULT_CHOICES | {group: value for group, value in given.items() if group in GROUPS}
+    _check_names(given, choices)
+    tuned = envs.find(choices["env"]).training.get(choices["algo"], {})
+    return from_dict(_hydra_compose(choices, tuned | {n: v for n, v in given.items() if n not in GROUPS}))
+
+
+def parse(arguments: Sequence[str]) -> dict[str, Any]:
+    """`name=value` arguments read by Hydra's grammar into plain values.
+
+    Raises:
+      UserError: an argument is not of that form, or a name is given twice.
+    """
+    from hydra.core.override_parser.overrides_parser import OverridesParser
+    from hydra.errors import HydraException
+
+    parser, given = OverridesParser.create(), {}
+    for argument in arguments:
+        try:
+            override = parser.parse_override(argument)
+        except HydraException:
+            raise UserError(f"'{argument}': expected name=value, such as seed=3; see --help") from None
+        name = override.key_or_group
+        if not (override.type.name == "CHANGE" and override.package is None and not override.is_sweep_override()):
+            raise UserError(f"'{argument}': expected name=value, such as seed=3; see --help")
+        if name in given:
+            raise UserError(f"{name} is given twice")
+        given[name] = _plain(override.value())
+    return given
+
+
+def _plain(value: Any) -> Any:
+    """Hydra's quoted strings as str, also inside lists."""
+    if isinstance(value, list):
+        return [_plain(element) for element in value]
+    return value if isinstance(value, (bool, int, float)) or value is None else str(getattr(value, "text", value))
+
+
+def _check_names(given: Mapping[str, Any], choices: Mapping[str, Any]) -> None:
+    problems = [unknown(group, str(choices[group]), members) for group, members in GROUPS.items() if choices[group] not in members]
+    if problems:
+        raise OptionError(problems)
+    known = set(option_fields(choices)) | set(GROUPS)
+    leaves = {name.rsplit(".", 1)[-1]: name for name in known}
+    for name in given:
+        if name not in known:
+            same_leaf = leaves.get(name.rsplit(".", 1)[-1])
+            problems.append(f"unknown option '{name}': did you mean '{same_leaf}'?" if same_leaf else unknown("option", name, known))
+    if problems:
+        raise OptionError(problems)
+
+
+def option_fields(choices: Mapping[str, str]) -> dict[str, dataclasses.Field]:
+    """Every option under these choices, by its name on the command line."""
+    fields = {field.name: field for field in dataclasses.fields(Run)}
+    for group, choice in choices.items():
+        fields |= {f"{group}.{field.name}": field for field in dataclasses.fields(GROUPS[group][choice])}
+    return fields
+
+
+def _hydra_compose(choices: Mapping[str, str], values: Mapping[str, Any]) -> dict[str, Any]:
+    """Hydra's composition of the groups' defaults and of `values`, as plain nested values."""
+    import hydra
+    from hydra.core.config_store import ConfigStore
+    from omegaconf import OmegaConf
+
+    store = ConfigStore.instance()
+    for group, members in GROUPS.items():
+        for name, schema in members.items():
+            store.store(name=name, group=group, node={"id": name, **dataclasses.asdict(schema())})
+    defaults = [{group: choice} for group, choice in choices.items()]
+    store.store(name="config", node={"defaults": [*defaults, "_self_"], **dataclasses.asdict(Run())})
+    with hydra.initialize(version_base=None, config_path=None):
+        composed = hydra.compose("config")
+    for name, value in values.items():
+        OmegaConf.update(composed, name, value)
+    return OmegaConf.to_container(composed, resolve=True)
+
+
+def save(config: Config, path: Path) -> None:
+    """Writes `config.yaml`."""
+    from omegaconf import OmegaConf
+
+    path.write_text(OmegaConf.to_yaml(OmegaConf.create(config.to_dict())), encoding="utf-8")
+
+
+def load(path: Path, changes: Mapping[str, Any] | None = None) -> Config:
+    """The configuration in a `config.yaml`, with some options changed.
+
+    Args:
+      path: the file.
+      changes: new values by dotted name.
+
+    Raises:
+      UserError: the file cannot be read; OptionError: a name, type or range in it or in the changes is wrong.
+    """
+    from omegaconf import OmegaConf
+
+    try:
+        stored = OmegaConf.load(path)
+        for name, value in (changes or {}).items():
+            OmegaConf.update(stored, name, value)
+        return from_dict(OmegaConf.to_container(stored))
+    except OptionError:
+        raise
+    except Exception as error:  # YAML and OmegaConf raise many kinds; whichever it is, the file is not ours
+        raise UserError(f"{path}: not a configuration of a run ({' '.join(str(error).split())})") from error
+
+
+def help_text(arguments: Sequence[str]) -> str:
+    """Every option with its default for the chosen environment and algorithm, its range and its meaning."""
+    config = compose(arguments)
+    values = config.to_dict()
+    lines = ["usage: python -m jaxpg.train [group=member] [option=value] ...", "       python -m jaxpg.train resume=DIR [total_steps=N]", ""]
+    for group, members in GROUPS.items():
+        lines.append(f"{group}={config.choices[group]}".ljust(28) + f"one of {', '.join(members)}")
+    section = None
+    for name, field in sorted(option_fields(config.choices).items(), key=lambda item: (item[0].rpartition(".")[0], 0)):
+        group, _, leaf = name.rpartition(".")
+        if group != section:
+            section = group
+            title = GROUPS[group][config.choices[group]].__doc__ if group else Run.__doc__
+            lines += ["", title.splitlines()[0]]
+        value = values[group][leaf] if group else values[leaf]
+        allowed = describe_range(field.metadata)
+        lines.append(f"  {name}={_shown(value)}".ljust(38) + field.metadata["help"] + (f" ({allowed})" if allowed else ""))
+    lines += ["", "Values shown are the defaults for the environment and the algorithm named above: add env=... or algo=... to see others."]
+    return "\n".join(lines)
+
+
+def _shown(value: Any) -> str:
+    if value is None:
+        return ""
+    if isinstance(value, bool):
+        return str(value).lower()
+    return str(value).replace(" ", "")

@@ -1,0 +1,187 @@
+"""From a configuration to the compiled functions of a training run."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import optax
+
+import envs
+from jaxpg import normalization
+from jaxpg.actor_critic import actor_critic, deterministic_policy, reinforce, td
+from jaxpg.evaluation import Episodes, evaluate
+from jaxpg.networks import Networks, mlp_networks
+from jaxpg.run.config import Config
+from jaxpg.training import train_scan
+from jaxpg.types import Algorithm, Metrics, PyTree, TrainState
+from jaxpg.vector_env import vectorize
+
+# Evaluations during training play the same starts in every run; `jaxpg.evaluate` draws others.
+SELECTION_SEED = 2**31
+
+
+class Policy(NamedTuple):
+    """What acting needs: the actor's and the critic's parameters and the observation statistics."""
+
+    params: PyTree
+    normalizer: normalization.RunningStatistics
+
+
+class Schedule(NamedTuple):
+    """How the updates are divided; the host looks between chunks only.
+
+    Attributes:
+      steps_per_update: environment steps of one update (of each agent).
+      chunk: updates between two lines of metrics.
+      num_chunks: chunks of the whole run; `total_steps` rounded up to whole ones.
+      eval_every, checkpoint_every: in chunks.
+    """
+
+    steps_per_update: int
+    chunk: int
+    num_chunks: int
+    eval_every: int
+    checkpoint_every: int
+
+    @property
+    def num_updates(self) -> int:
+        return self.chunk * self.num_chunks
+
+    @property
+    def total_steps(self) -> int:
+        return self.num_updates * self.steps_per_update
+
+    def is_due(self, update: int, every: int) -> bool:
+        """Whether something done every `every` chunks is due after `update` updates; at the end it always is."""
+        return update >= self.num_updates or (update // self.chunk) % every == 0
+
+
+class Program(NamedTuple):
+    """The compiled functions of a run; every state and result has the agents as its leading axis `[S, ...]`.
+
+    Attributes:
+      init: `init() -> TrainState`.
+      advance: `advance(state) -> (state, metrics)`, one chunk; metrics are `[S, chunk]`.
+      evaluate: `evaluate(Policy) -> Episodes` `[S, eval_episodes]`.
+      state_shape: shapes and types of the state.
+    """
+
+    init: Callable[[], TrainState]
+    advance: Callable[[TrainState], tuple[TrainState, Metrics]]
+    evaluate: Callable[[Policy], Episodes]
+    state_shape: TrainState
+
+
+def plan(config: Config) -> Schedule:
+    """The updates of a run: intervals in environment steps rounded up to whole updates and chunks."""
+    run = config.run
+    steps_per_update = run.num_envs * run.num_steps
+    num_updates = _ceil(run.total_steps, steps_per_update)
+    chunk = min(_ceil(run.log_interval, steps_per_update), num_updates)
+    chunk_steps = chunk * steps_per_update
+    return Schedule(
+        steps_per_update=steps_per_update,
+        chunk=chunk,
+        num_chunks=_ceil(num_updates, chunk),
+        eval_every=_ceil(run.eval_interval, chunk_steps),
+        checkpoint_every=_ceil(run.checkpoint_interval, chunk_steps),
+    )
+
+
+def make_env(config: Config) -> Any:
+    return envs.REGISTRY[config.choices["env"]].build(config.env)
+
+
+def make_networks(config: Config, env: Any) -> Networks:
+    network = config.network
+    return mlp_networks(
+        env.observation_size, env.action_size, network.widths, network.activation, network.sigma, network.learn_sigma
+    )
+
+
+def make_algorithm(config: Config, env: Any) -> Algorithm:
+    """One agent's algorithm, as pure functions."""
+    algo, run = config.algo, config.run
+    if config.choices["algo"] == "td":
+        method = td(algo.gamma, algo.lambda_, run.num_steps)
+    else:
+        method = reinforce(algo.gamma, algo.baseline)
+    return actor_critic(
+        vectorize(env, run.num_envs, config.env.episode_length),
+        make_networks(config, env),
+        make_optimizer(config),
+        method,
+        reward_scale=algo.reward_scale,
+        entropy_coef=algo.entropy_coef,
+        normalize_observations=algo.normalize_observations,
+        normalize_advantages=algo.normalize_advantages,
+    )
+
+
+def make_optimizer(config: Config) -> optax.GradientTransformation:
+    """Adam for actor and critic apart, with shortened gradients and linearly falling step sizes."""
+    algo, num_updates = config.algo, plan(config).num_updates
+
+    def adam(step_size):
+        schedule = optax.linear_schedule(step_size, step_size * algo.final_lr, num_updates)
+        return optax.chain(optax.clip_by_global_norm(algo.max_gradient_norm), optax.adam(schedule, eps=1e-5))
+
+    return optax.multi_transform(
+        {"actor": adam(algo.actor_lr), "critic": adam(algo.critic_lr)}, {"actor": "actor", "critic": "critic"}
+    )
+
+
+def compile_program(config: Config) -> Program:
+    """Traces and compiles the training chunk and the evaluation; the two compile side by side."""
+    run, schedule = config.run, plan(config)
+    env = make_env(config)
+    networks, algorithm = make_networks(config, env), make_algorithm(config, env)
+    keys = jnp.stack([jax.random.key(run.seed + i) for i in range(run.num_seeds)])
+
+    def init(key):
+        return algorithm.init(jax.random.split(key)[0])
+
+    def advance(key, state):
+        return train_scan(algorithm, key, schedule.chunk, state)
+
+    def play(policy):
+        act = deterministic_policy(networks, policy.params, policy.normalizer)
+        return evaluate(env, act, jax.random.key(SELECTION_SEED), run.eval_episodes, config.env.episode_length)
+
+    init, advance, play = (_over_agents(fn, run.num_seeds) for fn in (init, advance, play))
+    state = jax.eval_shape(init, keys)
+    with ThreadPoolExecutor() as pool:
+        compiled = [
+            pool.submit(_compile, fn, *arguments)
+            for fn, arguments in (
+                (advance, (keys, state)),
+                (play, (Policy(state.params, state.normalizer),)),
+                (init, (keys,)),
+            )
+        ]
+        advance, play, init = (future.result() for future in compiled)
+    return Program(lambda: init(keys), lambda state: advance(keys, state), play, state)
+
+
+def _compile(fn: Callable, *arguments: Any) -> Callable:
+    return jax.jit(fn).lower(*arguments).compile()
+
+
+def _over_agents(fn: Callable, num_seeds: int) -> Callable:
+    """`fn` for all agents; a single one is not mapped, so that its program branches instead of selecting."""
+    if num_seeds > 1:
+        return jax.vmap(fn)
+
+    def one(*arguments):
+        result = fn(*jax.tree.map(lambda x: x[0], arguments))
+        return jax.tree.map(lambda x: x[None], result)
+
+    return one
+
+
+def _ceil(a: int, b: int) -> int:
+    return -(-a // b)

@@ -1,0 +1,215 @@
+"""A training run from beginning to end: the loop on the host around the compiled chunks."""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Mapping
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxpg.evaluation import Episodes
+from jaxpg.run import config as configuration
+from jaxpg.run import figures, folder
+from jaxpg.run.checkpoint import Checkpoints
+from jaxpg.run.config import Config
+from jaxpg.run.errors import UserError
+from jaxpg.run.folder import MetricsLog, RunFolder, jsonable
+from jaxpg.run.program import Policy, Program, Schedule, compile_program, plan
+from jaxpg.run.runtime import StopRequests, prepare
+from jaxpg.run.terminal import Display, shown
+from jaxpg.types import Metrics, PyTree, TrainState
+
+# What may change together with resume=DIR; anything else would be another run.
+RESUMABLE = ("total_steps", "log_interval", "eval_interval", "checkpoint_interval")
+
+
+class Best(NamedTuple):
+    """The best policy of each agent, by its mean evaluation return.
+
+    Attributes:
+      policy: leaves `[S, ...]`.
+      episode_return: `[S]`; -inf before the first evaluation.
+    """
+
+    policy: Policy
+    episode_return: jax.Array
+
+
+class RunState(NamedTuple):
+    """What a checkpoint holds."""
+
+    train: TrainState
+    best: Best
+
+
+def begin(config: Config) -> int:
+    """Trains from the beginning; returns the exit status."""
+    prepare(config)
+    run_folder, schedule = folder.create(config), plan(config)
+    configuration.save(config, run_folder.config)
+    display = Display(schedule.total_steps)
+    run, algo = config.run, config.choices["algo"]
+    agents = f"seeds {run.seed} to {run.seed + run.num_seeds - 1}" if run.num_seeds > 1 else f"seed {run.seed}"
+    display.say(
+        f"{algo} on {config.choices['env']}, {agents}: {run.num_envs} environments x {run.num_steps} steps x "
+        f"{schedule.num_updates:,} updates = {schedule.total_steps:,} steps, into {run_folder.path}"
+    )
+    program, seconds = _compile(display, config)
+    train = program.init()
+    best = Best(Policy(train.params, train.normalizer), jnp.full(run.num_seeds, -jnp.inf))
+    return _train(config, run_folder, display, program, RunState(train, best), seconds)
+
+
+def resume(given: Mapping[str, Any]) -> int:
+    """Goes on from the newest checkpoint of the run in `given["resume"]`; returns the exit status."""
+    changes = {name: value for name, value in given.items() if name != "resume"}
+    run_folder = folder.find(str(given["resume"]))
+    config = _changed(run_folder, changes)
+    checkpoints = Checkpoints(run_folder.checkpoints)
+    update = checkpoints.latest()
+    if update is None:
+        raise UserError(f"{run_folder.path} has no checkpoint yet: start again with another run_dir")
+    recorded = folder.read_versions(run_folder)
+    prepare(config, recorded.get("threads"))
+    schedule = plan(config)
+    display = Display(schedule.total_steps, steps=update * schedule.steps_per_update)
+    if update >= schedule.num_updates:
+        display.say(f"{run_folder.path} is finished; a larger total_steps goes on")
+        return 0
+    display.say(f"resuming {run_folder.path} at {update * schedule.steps_per_update:,} of {schedule.total_steps:,} steps")
+    for name, now in folder.versions().items():
+        if recorded.get(name) != now:
+            display.say(f"note: {name} was {recorded.get(name)} and is {now}: the same run, but not the same bits")
+    program, seconds = _compile(display, config)
+    state = checkpoints.restore(update, _template(program, config.run.num_seeds))
+    configuration.save(config, run_folder.config)
+    return _train(config, run_folder, display, program, state, seconds)
+
+
+def _changed(run_folder: RunFolder, changes: Mapping[str, Any]) -> Config:
+    """The stored configuration with the changes, if these leave it the same run."""
+    stored = configuration.load(run_folder.config).to_dict()
+    config = configuration.load(run_folder.config, changes)
+    for name, value in changes.items():
+        group, _, leaf = name.rpartition(".")
+        before = stored[group].get(leaf) if group else stored.get(name)
+        if name not in RESUMABLE and value != before:
+            raise UserError(f"{name}={value} would be another run than {run_folder.path}; only {', '.join(RESUMABLE)} may change")
+    return config
+
+
+def _template(program: Program, num_seeds: int) -> RunState:
+    train = program.state_shape
+    best = Best(Policy(train.params, train.normalizer), jax.eval_shape(lambda: jnp.zeros(num_seeds)))
+    return RunState(train, best)
+
+
+def _compile(display: Display, config: Config) -> tuple[Program, float]:
+    display.say("compiling ...")
+    began = time.monotonic()
+    program = compile_program(config)
+    seconds = time.monotonic() - began
+    display.say(f"compiled in {seconds:.1f} s")
+    return program, seconds
+
+
+def _train(
+    config: Config, run_folder: RunFolder, display: Display, program: Program, state: RunState, compile_seconds: float
+) -> int:
+    """Chunk after chunk until the last update or a request to stop; returns the exit status."""
+    schedule = plan(config)
+    keeper = _Keeper(run_folder, config)
+    first = update = int(state.train.update[0])
+    log = MetricsLog(run_folder, update)
+    began, seconds_before = time.monotonic(), log.seconds
+    display.start()
+    try:
+        with StopRequests() as stop:
+            while update < schedule.num_updates and not stop.signal:
+                train, metrics = program.advance(state.train)
+                update = int(train.update[0])
+                line = {"update": update, "steps": update * schedule.steps_per_update} | _summary(metrics)
+                state = state._replace(train=train)
+                if schedule.is_due(update, schedule.eval_every):
+                    state, evaluation = _evaluate(program, state)
+                    line |= evaluation
+                line["seconds"] = round(seconds_before + time.monotonic() - began, 3)
+                log.write(line)
+                display.update(line)
+                if schedule.is_due(update, schedule.checkpoint_every) or stop.signal:
+                    keeper.save(update, state)
+    finally:
+        display.stop()
+        log.close()
+    training_seconds = time.monotonic() - began
+    if stop.signal:
+        display.say(f"{stop.signal.name}: stopped at {line['steps']:,} steps; resume=" f"{run_folder.path} goes on")
+        return 128 + stop.signal
+    lines = folder.read_metrics(run_folder)
+    figures.learning_curve(lines, run_folder.learning_curve, title=f"{config.choices['algo']} on {config.choices['env']}")
+    rate = (update - first) * schedule.steps_per_update * config.run.num_seeds / training_seconds
+    display.table(_closing_rows(lines, run_folder, rate, compile_seconds, training_seconds))
+    return 0
+
+
+class _Keeper:
+    """Writes the run's state to `checkpoints/` and its best policy to `best/`."""
+
+    def __init__(self, run_folder: RunFolder, config: Config):
+        self._checkpoints = Checkpoints(run_folder.checkpoints)
+        self._best = Checkpoints(run_folder.best, keep=1)
+        self._meta = {"config": config.to_dict()}
+
+    def save(self, update: int, state: RunState) -> None:
+        self._checkpoints.save(update, state, self._meta)
+        self._best.replace(update, state.best, self._meta)
+
+
+def _summary(metrics: Metrics) -> dict[str, Any]:
+    """One line of metrics for a chunk: means over its updates, and the mean return of the episodes that ended."""
+    values = {name: np.asarray(value, np.float64) for name, value in metrics.items()}  # [S, chunk]
+    return_sum, episodes = values.pop("return_sum").sum(axis=-1), values.pop("episodes").sum(axis=-1)
+    mean_return = np.where(episodes > 0, return_sum / np.maximum(episodes, 1), np.nan)
+    means = {name: jsonable(value.mean(axis=-1)) for name, value in values.items()}
+    return {"return": jsonable(mean_return), "episodes": jsonable(episodes)} | means
+
+
+def _evaluate(program: Program, state: RunState) -> tuple[RunState, dict[str, Any]]:
+    """The deterministic policy's results, and the state with the best policy kept."""
+    policy = Policy(state.train.params, state.train.normalizer)
+    episodes: Episodes = program.evaluate(policy)
+    mean_return = episodes.episode_return.mean(axis=-1)
+    results = {"return": mean_return} | {name: value.mean(axis=-1) for name, value in episodes.metrics.items()}
+    best = _better(state.best, Best(policy, mean_return))
+    return state._replace(best=best), {f"eval_{name}": jsonable(value) for name, value in results.items()}
+
+
+def _better(old: Best, new: Best) -> Best:
+    improved = new.episode_return > old.episode_return  # a NaN is no improvement
+
+    def choose(a: jax.Array, b: jax.Array) -> jax.Array:
+        return jnp.where(improved.reshape(improved.shape + (1,) * (a.ndim - 1)), a, b)
+
+    return jax.tree.map(choose, new, old)
+
+
+def _closing_rows(
+    lines: list[dict[str, Any]], run_folder: RunFolder, rate: float, compile_seconds: float, training_seconds: float
+) -> dict[str, str]:
+    evaluations = [line for line in lines if "eval_return" in line]
+    last = evaluations[-1]
+    best = figures.series(evaluations, "eval_return")[1].max(axis=1, initial=-np.inf).tolist()
+    rows = {"deterministic return": f"{shown(last['eval_return'])} at the end, {shown(best)} at best"}
+    if "eval_success" in last:
+        success = np.mean(last["eval_success"])
+        rows["success"] = f"{success:.1%} at the end"
+    return rows | {
+        "speed": f"{rate:,.0f} steps/s",
+        "time": f"{compile_seconds:.1f} s compiling, {training_seconds:.1f} s training",
+        "run folder": str(run_folder.path),
+        "evaluate it": f"python -m jaxpg.evaluate run={run_folder.path}",
+    }

@@ -1,0 +1,66 @@
+"""What a person sees while a run goes on: a progress bar on a terminal, plain lines elsewhere."""
+
+from __future__ import annotations
+
+import sys
+import time
+from typing import Any
+
+from rich.console import Console
+from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeRemainingColumn
+from rich.table import Table
+
+
+class Display:
+    """Progress of a run of `total_steps` environment steps, `steps` of which are done."""
+
+    def __init__(self, total_steps: int, steps: int = 0):
+        self.console = Console(highlight=False, soft_wrap=True)
+        self._total = total_steps
+        self._first_steps, self._began = steps, time.monotonic()
+        self._bar = None
+        if self.console.is_terminal:
+            columns = (TextColumn("training"), BarColumn(bar_width=24), TaskProgressColumn(), TimeRemainingColumn())
+            self._bar = Progress(*columns, TextColumn("{task.description}"), console=self.console)
+            self._task = self._bar.add_task("", total=total_steps, completed=steps)
+
+    def say(self, text: str) -> None:
+        self.console.print(text, markup=False)
+
+    def start(self) -> None:
+        """Training begins now."""
+        self._began = time.monotonic()
+        if self._bar:
+            self._bar.start()
+
+    def update(self, line: dict[str, Any]) -> None:
+        """Shows a line of metrics: every one on the bar, those with an evaluation as plain text."""
+        seconds = time.monotonic() - self._began
+        rate = (line["steps"] - self._first_steps) / max(seconds, 1e-9)
+        text = f"{rate:,.0f} steps/s  return {shown(line.get('return'))}"
+        if self._bar:
+            self._bar.update(self._task, completed=line["steps"], description=text)
+        elif "eval_return" in line:
+            left = (self._total - line["steps"]) / rate
+            self.say(
+                f"{line['steps'] / self._total:4.0%}  {line['steps']:>12,} steps  {text}  "
+                f"deterministic {shown(line['eval_return'])}  {left:.0f} s left"
+            )
+            sys.stdout.flush()
+
+    def stop(self) -> None:
+        if self._bar:
+            self._bar.stop()
+
+    def table(self, rows: dict[str, str]) -> None:
+        """The short table at the end."""
+        table = Table(show_header=False, box=None, pad_edge=False)
+        for name, value in rows.items():
+            table.add_row(name, value, style=None)
+        self.console.print(table)
+
+
+def shown(value: Any) -> str:
+    """A metric for people: the mean where there are several agents, n/a where there is none yet."""
+    numbers = [x for x in (value if isinstance(value, list) else [value]) if x is not None]
+    return f"{sum(numbers) / len(numbers):.1f}" if numbers else "n/a"

@@ -1,0 +1,25 @@
+"""`python -m jaxpg.train`: trains an agent and leaves a run folder behind; `--help` lists every option."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from jaxpg.run.errors import run_command
+
+
+def main(arguments: Sequence[str]) -> int:
+    """The training command; returns its exit status."""
+    from jaxpg.run import config
+
+    if {"--help", "-h"} & set(arguments):
+        print(config.help_text([argument for argument in arguments if not argument.startswith("-")]))
+        return 0
+    from jaxpg.run import session
+
+    if any(argument.startswith("resume=") for argument in arguments):
+        return session.resume(config.parse(arguments))
+    return session.begin(config.compose(arguments))
+
+
+if __name__ == "__main__":
+    run_command(main)
