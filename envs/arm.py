@@ -31,7 +31,9 @@ STANDARD_GRAVITY = 9.81  # [m/s^2]
 class ArmConfig:
     """Options of the arm."""
 
-    reward: str = option("lesson", "squared distance, or one that pulls at the last centimetres too", choices=("lesson", "precise"))
+    reward: str = option(
+        "lesson", "squared distance, or one that pulls at the last centimetres too", choices=("lesson", "precise")
+    )
     control: str = option("torque", "what an action commands", choices=("torque", "velocity"))
     gravity: bool = option(False, "the arm moves in the upright plane, under gravity")
     lambda_pos: float = option(1.0, "weight of the position error in the reward [1/m^2]", at_least=0)
@@ -63,8 +65,24 @@ class ArmConfig:
 
 
 TRAINING = {
-    "td": {"num_envs": 128, "num_steps": 16, "total_steps": 12_000_000, "algo.gamma": 0.9},
-    "reinforce": {"num_envs": 128, "total_steps": 12_000_000, "algo.gamma": 0.9},
+    "td": {
+        "num_envs": 64,
+        "num_steps": 16,
+        "total_steps": 12_000_000,
+        "log_interval": 100_000,
+        "eval_interval": 500_000,
+        "checkpoint_interval": 2_000_000,
+        "algo.gamma": 0.9,
+        "algo.final_lr": 0.01,
+    },
+    "reinforce": {
+        "num_envs": 16,
+        "total_steps": 8_000_000,
+        "log_interval": 100_000,
+        "eval_interval": 500_000,
+        "checkpoint_interval": 2_000_000,
+        "algo.gamma": 0.9,
+    },
 }
 
 

@@ -15,8 +15,8 @@ from typing import Any
 from envs.options import OptionError, option, unknown
 
 TRAINING = {
-    "td": {"num_envs": 64, "num_steps": 16, "total_steps": 2_000_000, "algo.gamma": 0.99},
-    "reinforce": {"num_envs": 16, "total_steps": 2_000_000, "algo.gamma": 0.99},
+    "td": {"num_envs": 64, "total_steps": 2_000_000, "eval_episodes": 16},
+    "reinforce": {"num_envs": 16, "total_steps": 2_000_000, "eval_episodes": 16},
 }
 
 

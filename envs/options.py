@@ -91,10 +91,12 @@ def build(config_class: type[Config], overrides: Mapping[str, Any], prefix: str 
 
 
 def unknown(kind: str, name: str, known: Iterable[str]) -> str:
-    """`unknown KIND 'NAME'` with the nearest known name, or with all of them where none is near."""
+    """`unknown KIND 'NAME'` with the nearest known name, or with all of them where none is near and they are few."""
     known = sorted(known)
     near = difflib.get_close_matches(name, known, n=1, cutoff=0.6)
-    return f"unknown {kind} '{name}': " + (f"did you mean '{near[0]}'?" if near else f"known are {', '.join(known)}")
+    if near:
+        return f"unknown {kind} '{name}': did you mean '{near[0]}'?"
+    return f"unknown {kind} '{name}': " + (f"known are {', '.join(known)}" if len(known) <= 20 else "see --help")
 
 
 def convert(hint: Any, value: Any) -> Any:
@@ -120,12 +122,18 @@ def convert(hint: Any, value: Any) -> Any:
     raise ValueError(f"expected {_TYPE_NAMES[hint]}")
 
 
+def describe(field: dataclasses.Field) -> str:
+    """The field's help, with its allowed range in brackets."""
+    allowed = describe_range(field.metadata)
+    return field.metadata["help"] + (f" ({allowed})" if allowed else "")
+
+
 def describe_range(metadata: Mapping[str, Any]) -> str:
     """The allowed range in words, such as `above 0, at most 1`; empty where anything goes."""
     if metadata.get("choices"):
         return " or ".join(metadata["choices"])
     bounds = [(key, metadata.get(key)) for key in _BOUNDS]
-    return ", ".join(f"{key.replace('_', ' ')} {bound:g}" for key, bound in bounds if bound is not None)
+    return ", ".join(f"{key.replace('_', ' ')} {bound}" for key, bound in bounds if bound is not None)
 
 
 def _check_range(metadata: Mapping[str, Any], value: Any) -> None:

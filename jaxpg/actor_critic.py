@@ -170,7 +170,7 @@ def actor_critic(
         if normalize_observations:
             normalizer = normalization.update(normalizer, transition.obs)
         metrics = losses | {
-            "gradient_norm": optax.global_norm(gradients),
+            "gradient_norm": optax.tree.norm(gradients),
             "return_sum": jnp.sum(transition.episode_return),
             "episodes": jnp.sum(transition.episode_end),
         }
@@ -190,9 +190,7 @@ def sampling_policy(networks: Networks, params: PyTree, normalizer: PyTree) -> P
     return policy_fn
 
 
-def deterministic_policy(
-    networks: Networks, params: PyTree, normalizer: PyTree
-) -> Callable[[jax.Array], jax.Array]:
+def deterministic_policy(networks: Networks, params: PyTree, normalizer: PyTree) -> Callable[[jax.Array], jax.Array]:
     """`policy(obs) -> action` in [-1, 1]: tanh of the Gaussian's mean."""
 
     def policy(obs):

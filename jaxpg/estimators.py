@@ -110,9 +110,7 @@ def reinforce_value_baseline(reward: jax.Array, discount: jax.Array | float, val
     return Estimate(returns - value, returns)
 
 
-def td_zero(
-    reward: jax.Array, discount: jax.Array | float, value: jax.Array, next_value: jax.Array
-) -> Estimate:
+def td_zero(reward: jax.Array, discount: jax.Array | float, value: jax.Array, next_value: jax.Array) -> Estimate:
     """The one-step TD error as advantage, TD(0).
 
         A_t = delta_t = r_t + d_t V(s_{t+1}) - V(s_t)
@@ -169,9 +167,7 @@ def td_lambda(
     return Estimate(returns - value, returns)
 
 
-def normalize_advantages(
-    advantage: jax.Array, weight: jax.Array | float = 1.0, epsilon: float = 1e-8
-) -> jax.Array:
+def normalize_advantages(advantage: jax.Array, weight: jax.Array | float = 1.0, epsilon: float = 1e-8) -> jax.Array:
     """Advantages with mean 0 and standard deviation 1 over the whole batch.
 
         A'_t = (A_t - mean A) / (std A + epsilon),    with weighted mean and variance

@@ -11,9 +11,7 @@ import jax
 import jax.numpy as jnp
 
 
-def policy_gradient_loss(
-    log_prob: jax.Array, advantage: jax.Array, weight: jax.Array | float = 1.0
-) -> jax.Array:
+def policy_gradient_loss(log_prob: jax.Array, advantage: jax.Array, weight: jax.Array | float = 1.0) -> jax.Array:
     """Surrogate whose gradient is minus the estimated policy gradient.
 
         L = -mean(w_t log pi(a_t | s_t) stop(A_t)),    grad L = -mean(w_t grad log pi(a_t | s_t) A_t)

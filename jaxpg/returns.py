@@ -37,9 +37,7 @@ def discounted_returns(reward: jax.Array, discount: jax.Array | float, bootstrap
     return _backward(reward, discount, bootstrap)
 
 
-def td_errors(
-    reward: jax.Array, discount: jax.Array | float, value: jax.Array, next_value: jax.Array
-) -> jax.Array:
+def td_errors(reward: jax.Array, discount: jax.Array | float, value: jax.Array, next_value: jax.Array) -> jax.Array:
     """One-step temporal-difference errors.
 
         delta_t = r_t + d_t V(s_{t+1}) - V(s_t)

@@ -12,7 +12,7 @@ def train_scan(
 ) -> tuple[TrainState, Metrics]:
     """`num_updates` updates, from the beginning or from a given state.
 
-        state_{i+1}, metrics_i = step(state_i, fold_in(key, i))
+        state_0 = init(fold_in(key, 0)),    state_{i+1}, metrics_i = step(state_i, fold_in(key, i + 1))
 
     The key is an argument and i is counted in the state: training in pieces with the same key is training in one
     piece. Several seeds are `jax.vmap` of this function over the key (and the state).
@@ -26,11 +26,15 @@ def train_scan(
     Returns:
       The state after the last update, and the metrics of each update, `[num_updates]` by name.
     """
-    key_init, key_updates = jax.random.split(key)
     if state is None:
-        state = algorithm.init(key_init)
+        state = initial_state(algorithm, key)
 
     def update(state, _):
-        return algorithm.step(state, jax.random.fold_in(key_updates, state.update))
+        return algorithm.step(state, jax.random.fold_in(key, state.update + 1))
 
     return jax.lax.scan(update, state, length=num_updates)
+
+
+def initial_state(algorithm: Algorithm, key: jax.Array) -> TrainState:
+    """The state before the first update of the run with this key."""
+    return algorithm.init(jax.random.fold_in(key, 0))

@@ -95,7 +95,9 @@ class Checkpoints:
     def _check_same_program(self, step: int, recorded: Mapping[str, Any], expected: Mapping[str, Any]) -> None:
         names = sorted(recorded.keys() ^ expected.keys())
         if names:
-            raise CheckpointError(f"{self.folder / str(step)}: made by another program: {names[0]} is in only one of them")
+            raise CheckpointError(
+                f"{self.folder / str(step)}: made by another program: {names[0]} is in only one of them"
+            )
         for name, leaf in expected.items():
             ours, saved = _storage(leaf), recorded[name]
             if [list(ours.shape), str(ours.dtype)] != saved[:2]:

@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any
 
 import envs
-from envs.options import OptionError, build, describe_range, option, unknown
+from envs.options import OptionError, build, describe, option, unknown
 from jaxpg.actor_critic import BASELINES
 from jaxpg.networks import ACTIVATIONS
 from jaxpg.run.errors import UserError
@@ -71,7 +71,7 @@ class Run:
     total_steps: int = option(1_000_000, "environment steps to train for, of each agent", at_least=1)
     log_interval: int = option(50_000, "environment steps between two lines of metrics", at_least=1)
     eval_interval: int = option(250_000, "environment steps between two evaluations", at_least=1)
-    eval_episodes: int = option(128, "episodes of an evaluation", at_least=1)
+    eval_episodes: int = option(512, "episodes of an evaluation", at_least=1)
     checkpoint_interval: int = option(1_000_000, "environment steps between two checkpoints", at_least=1)
     run_dir: str | None = option(None, "run folder [default: runs/<env>-<algo>-s<seed>-<time>]")
 
@@ -135,7 +135,9 @@ def _complete(config: Config) -> Config:
     given, horizon = config.run.num_steps, config.env.episode_length
     if config.choices["algo"] == "reinforce":
         if given not in (None, horizon):
-            raise OptionError([f"num_steps={given}: algo=reinforce plays whole episodes, {horizon} steps here; leave it out"])
+            raise OptionError(
+                [f"num_steps={given}: algo=reinforce plays whole episodes, {horizon} steps here; leave it out"]
+            )
         given = horizon
     if config.run.num_seeds + config.run.seed > 2**32:
         raise OptionError([f"seed={config.run.seed} num_seeds={config.run.num_seeds}: seeds must stay below 2**32"])
@@ -190,7 +192,11 @@ def _plain(value: Any) -> Any:
 
 
 def _check_names(given: Mapping[str, Any], choices: Mapping[str, Any]) -> None:
-    problems = [unknown(group, str(choices[group]), members) for group, members in GROUPS.items() if choices[group] not in members]
+    problems = [
+        unknown(group, str(choices[group]), members)
+        for group, members in GROUPS.items()
+        if choices[group] not in members
+    ]
     if problems:
         raise OptionError(problems)
     known = set(option_fields(choices)) | set(GROUPS)
@@ -198,7 +204,9 @@ def _check_names(given: Mapping[str, Any], choices: Mapping[str, Any]) -> None:
     for name in given:
         if name not in known:
             same_leaf = leaves.get(name.rsplit(".", 1)[-1])
-            problems.append(f"unknown option '{name}': did you mean '{same_leaf}'?" if same_leaf else unknown("option", name, known))
+            problems.append(
+                f"unknown option '{name}': did you mean '{same_leaf}'?" if same_leaf else unknown("option", name, known)
+            )
     if problems:
         raise OptionError(problems)
 
@@ -221,10 +229,10 @@ def _hydra_compose(choices: Mapping[str, str], values: Mapping[str, Any]) -> dic
     for group, members in GROUPS.items():
         for name, schema in members.items():
             store.store(name=name, group=group, node={"id": name, **dataclasses.asdict(schema())})
-    defaults = [{group: choice} for group, choice in choices.items()]
+    defaults = [{group: choice} for group, choice in DEFAULT_CHOICES.items()]
     store.store(name="config", node={"defaults": [*defaults, "_self_"], **dataclasses.asdict(Run())})
     with hydra.initialize(version_base=None, config_path=None):
-        composed = hydra.compose("config")
+        composed = hydra.compose("config", [f"{group}={choice}" for group, choice in choices.items()])
     for name, value in values.items():
         OmegaConf.update(composed, name, value)
     return OmegaConf.to_container(composed, resolve=True)
@@ -237,47 +245,73 @@ def save(config: Config, path: Path) -> None:
     path.write_text(OmegaConf.to_yaml(OmegaConf.create(config.to_dict())), encoding="utf-8")
 
 
-def load(path: Path, changes: Mapping[str, Any] | None = None) -> Config:
-    """The configuration in a `config.yaml`, with some options changed.
-
-    Args:
-      path: the file.
-      changes: new values by dotted name.
+def load(path: Path) -> Config:
+    """The configuration in a `config.yaml`.
 
     Raises:
-      UserError: the file cannot be read; OptionError: a name, type or range in it or in the changes is wrong.
+      UserError: the file cannot be read; OptionError: a name, type or range in it is wrong.
     """
     from omegaconf import OmegaConf
 
     try:
-        stored = OmegaConf.load(path)
-        for name, value in (changes or {}).items():
-            OmegaConf.update(stored, name, value)
-        return from_dict(OmegaConf.to_container(stored))
+        return from_dict(OmegaConf.to_container(OmegaConf.load(path)))
     except OptionError:
         raise
     except Exception as error:  # YAML and OmegaConf raise many kinds; whichever it is, the file is not ours
         raise UserError(f"{path}: not a configuration of a run ({' '.join(str(error).split())})") from error
 
 
+def change(config: Config, changes: Mapping[str, Any]) -> Config:
+    """The configuration with new values, by dotted name.
+
+    Raises:
+      OptionError: an unknown name, another member of a group, a wrong type or a value out of range.
+    """
+    _check_names(changes, config.choices | {name: value for name, value in changes.items() if name in GROUPS})
+    others = [name for name in GROUPS if changes.get(name, config.choices[name]) != config.choices[name]]
+    if others:
+        raise OptionError([f"{name}={changes[name]}: the run has {name}={config.choices[name]}" for name in others])
+    values = config.to_dict()
+    for name, value in changes.items():
+        group, _, leaf = name.rpartition(".")
+        if name not in GROUPS:
+            (values[group] if group else values)[leaf] = value
+    return from_dict(values)
+
+
+def flatten(config: Config) -> dict[str, Any]:
+    """The values of all options by their names on the command line."""
+    values = config.to_dict()
+    return {
+        name: values[group][leaf] if group else values[leaf]
+        for name in option_fields(config.choices)
+        for group, _, leaf in [name.rpartition(".")]
+    }
+
+
 def help_text(arguments: Sequence[str]) -> str:
     """Every option with its default for the chosen environment and algorithm, its range and its meaning."""
     config = compose(arguments)
-    values = config.to_dict()
-    lines = ["usage: python -m jaxpg.train [group=member] [option=value] ...", "       python -m jaxpg.train resume=DIR [total_steps=N]", ""]
+    values = flatten(config)
+    lines = [
+        "usage: python -m jaxpg.train [group=member] [option=value] ...",
+        "       python -m jaxpg.train resume=DIR [total_steps=N]",
+        "",
+    ]
     for group, members in GROUPS.items():
         lines.append(f"{group}={config.choices[group]}".ljust(28) + f"one of {', '.join(members)}")
     section = None
-    for name, field in sorted(option_fields(config.choices).items(), key=lambda item: (item[0].rpartition(".")[0], 0)):
-        group, _, leaf = name.rpartition(".")
+    for name, field in sorted(option_fields(config.choices).items(), key=lambda item: item[0].rpartition(".")[0]):
+        group = name.rpartition(".")[0]
         if group != section:
             section = group
             title = GROUPS[group][config.choices[group]].__doc__ if group else Run.__doc__
             lines += ["", title.splitlines()[0]]
-        value = values[group][leaf] if group else values[leaf]
-        allowed = describe_range(field.metadata)
-        lines.append(f"  {name}={_shown(value)}".ljust(38) + field.metadata["help"] + (f" ({allowed})" if allowed else ""))
-    lines += ["", "Values shown are the defaults for the environment and the algorithm named above: add env=... or algo=... to see others."]
+        lines.append(f"  {name}={_shown(values[name])}".ljust(38) + describe(field))
+    lines += [
+        "",
+        "Values shown are the defaults for the environment and the algorithm named above: add env=... or algo=... to see others.",
+    ]
     return "\n".join(lines)
 
 

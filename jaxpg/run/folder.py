@@ -1,12 +1,12 @@
 """The run folder: what is in it, and under which name.
 
-    config.yaml         the options, complete
-    versions.json       what computed it
-    metrics.jsonl       one line for each chunk of updates
-    tb/                 the same for TensorBoard
-    checkpoints/        the whole training state, the newest few
-    best/               the best policy so far
-    learning_curve.png  the curve
+config.yaml         the options, complete
+versions.json       what computed it
+metrics.jsonl       one line for each chunk of updates
+tb/                 the same for TensorBoard
+checkpoints/        the whole training state, the newest few
+best/               the best policy so far
+learning_curve.png  the curve
 """
 
 from __future__ import annotations

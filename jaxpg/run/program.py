@@ -11,24 +11,17 @@ import jax.numpy as jnp
 import optax
 
 import envs
-from jaxpg import normalization
 from jaxpg.actor_critic import actor_critic, deterministic_policy, reinforce, td
 from jaxpg.evaluation import Episodes, evaluate
 from jaxpg.networks import Networks, mlp_networks
 from jaxpg.run.config import Config
-from jaxpg.training import train_scan
-from jaxpg.types import Algorithm, Metrics, PyTree, TrainState
+from jaxpg.run.state import Policy, RunState, current_policy, start
+from jaxpg.training import initial_state, train_scan
+from jaxpg.types import Algorithm, Metrics, TrainState
 from jaxpg.vector_env import vectorize
 
 # Evaluations during training play the same starts in every run; `jaxpg.evaluate` draws others.
 SELECTION_SEED = 2**31
-
-
-class Policy(NamedTuple):
-    """What acting needs: the actor's and the critic's parameters and the observation statistics."""
-
-    params: PyTree
-    normalizer: normalization.RunningStatistics
 
 
 class Schedule(NamedTuple):
@@ -64,16 +57,16 @@ class Program(NamedTuple):
     """The compiled functions of a run; every state and result has the agents as its leading axis `[S, ...]`.
 
     Attributes:
-      init: `init() -> TrainState`.
-      advance: `advance(state) -> (state, metrics)`, one chunk; metrics are `[S, chunk]`.
+      init: `init() -> RunState`.
+      advance: `advance(TrainState) -> (TrainState, metrics)`, one chunk; metrics are `[S, chunk]`.
       evaluate: `evaluate(Policy) -> Episodes` `[S, eval_episodes]`.
-      state_shape: shapes and types of the state.
+      state_shape: shapes and types of the run's state.
     """
 
-    init: Callable[[], TrainState]
+    init: Callable[[], RunState]
     advance: Callable[[TrainState], tuple[TrainState, Metrics]]
     evaluate: Callable[[Policy], Episodes]
-    state_shape: TrainState
+    state_shape: RunState
 
 
 def plan(config: Config) -> Schedule:
@@ -140,38 +133,42 @@ def compile_program(config: Config) -> Program:
     run, schedule = config.run, plan(config)
     env = make_env(config)
     networks, algorithm = make_networks(config, env), make_algorithm(config, env)
-    keys = jnp.stack([jax.random.key(run.seed + i) for i in range(run.num_seeds)])
+    keys = agent_keys(config)
 
-    def init(key):
-        return algorithm.init(jax.random.split(key)[0])
-
-    def advance(key, state):
-        return train_scan(algorithm, key, schedule.chunk, state)
+    def advance(key, train):
+        return train_scan(algorithm, key, schedule.chunk, train)
 
     def play(policy):
         act = deterministic_policy(networks, policy.params, policy.normalizer)
         return evaluate(env, act, jax.random.key(SELECTION_SEED), run.eval_episodes, config.env.episode_length)
 
-    init, advance, play = (_over_agents(fn, run.num_seeds) for fn in (init, advance, play))
-    state = jax.eval_shape(init, keys)
+    init = initializer(config, algorithm)
+    shape = jax.eval_shape(init, keys)
     with ThreadPoolExecutor() as pool:
-        compiled = [
-            pool.submit(_compile, fn, *arguments)
-            for fn, arguments in (
-                (advance, (keys, state)),
-                (play, (Policy(state.params, state.normalizer),)),
-                (init, (keys,)),
-            )
-        ]
-        advance, play, init = (future.result() for future in compiled)
-    return Program(lambda: init(keys), lambda state: advance(keys, state), play, state)
+        advance, play, init = pool.map(
+            _compile,
+            (over_agents(advance, run.num_seeds), over_agents(play, run.num_seeds), init),
+            ((keys, shape.train), (current_policy(shape.train),), (keys,)),
+        )
+    return Program(lambda: init(keys), lambda train: advance(keys, train), play, shape)
 
 
-def _compile(fn: Callable, *arguments: Any) -> Callable:
+def agent_keys(config: Config) -> jax.Array:
+    """The random keys of the agents, `[S]`: of the seeds seed, seed + 1, ..."""
+    return jnp.stack([jax.random.key(config.run.seed + i) for i in range(config.run.num_seeds)])
+
+
+def initializer(config: Config, algorithm: Algorithm) -> Callable[[jax.Array], RunState]:
+    """`init(keys[S]) -> RunState`, the run before its first update."""
+    init = over_agents(lambda key: initial_state(algorithm, key), config.run.num_seeds)
+    return lambda keys: start(init(keys))
+
+
+def _compile(fn: Callable, arguments: tuple) -> Callable:
     return jax.jit(fn).lower(*arguments).compile()
 
 
-def _over_agents(fn: Callable, num_seeds: int) -> Callable:
+def over_agents(fn: Callable, num_seeds: int) -> Callable:
     """`fn` for all agents; a single one is not mapped, so that its program branches instead of selecting."""
     if num_seeds > 1:
         return jax.vmap(fn)

@@ -2,48 +2,26 @@
 
 from __future__ import annotations
 
-import json
 import time
 from collections.abc import Mapping
-from typing import Any, NamedTuple
+from typing import Any
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 
-from jaxpg.evaluation import Episodes
 from jaxpg.run import config as configuration
 from jaxpg.run import figures, folder
 from jaxpg.run.checkpoint import Checkpoints
 from jaxpg.run.config import Config
 from jaxpg.run.errors import UserError
 from jaxpg.run.folder import MetricsLog, RunFolder, jsonable
-from jaxpg.run.program import Policy, Program, Schedule, compile_program, plan
+from jaxpg.run.program import Program, compile_program, plan
 from jaxpg.run.runtime import StopRequests, prepare
+from jaxpg.run.state import Best, RunState, better, current_policy
 from jaxpg.run.terminal import Display, shown
-from jaxpg.types import Metrics, PyTree, TrainState
+from jaxpg.types import Metrics
 
 # What may change together with resume=DIR; anything else would be another run.
 RESUMABLE = ("total_steps", "log_interval", "eval_interval", "checkpoint_interval")
-
-
-class Best(NamedTuple):
-    """The best policy of each agent, by its mean evaluation return.
-
-    Attributes:
-      policy: leaves `[S, ...]`.
-      episode_return: `[S]`; -inf before the first evaluation.
-    """
-
-    policy: Policy
-    episode_return: jax.Array
-
-
-class RunState(NamedTuple):
-    """What a checkpoint holds."""
-
-    train: TrainState
-    best: Best
 
 
 def begin(config: Config) -> int:
@@ -59,9 +37,7 @@ def begin(config: Config) -> int:
         f"{schedule.num_updates:,} updates = {schedule.total_steps:,} steps, into {run_folder.path}"
     )
     program, seconds = _compile(display, config)
-    train = program.init()
-    best = Best(Policy(train.params, train.normalizer), jnp.full(run.num_seeds, -jnp.inf))
-    return _train(config, run_folder, display, program, RunState(train, best), seconds)
+    return _train(config, run_folder, display, program, program.init(), seconds)
 
 
 def resume(given: Mapping[str, Any]) -> int:
@@ -80,32 +56,30 @@ def resume(given: Mapping[str, Any]) -> int:
     if update >= schedule.num_updates:
         display.say(f"{run_folder.path} is finished; a larger total_steps goes on")
         return 0
-    display.say(f"resuming {run_folder.path} at {update * schedule.steps_per_update:,} of {schedule.total_steps:,} steps")
+    display.say(
+        f"resuming {run_folder.path} at {update * schedule.steps_per_update:,} of {schedule.total_steps:,} steps"
+    )
     for name, now in folder.versions().items():
         if recorded.get(name) != now:
             display.say(f"note: {name} was {recorded.get(name)} and is {now}: the same run, but not the same bits")
     program, seconds = _compile(display, config)
-    state = checkpoints.restore(update, _template(program, config.run.num_seeds))
+    state = checkpoints.restore(update, program.state_shape)
     configuration.save(config, run_folder.config)
     return _train(config, run_folder, display, program, state, seconds)
 
 
 def _changed(run_folder: RunFolder, changes: Mapping[str, Any]) -> Config:
     """The stored configuration with the changes, if these leave it the same run."""
-    stored = configuration.load(run_folder.config).to_dict()
-    config = configuration.load(run_folder.config, changes)
-    for name, value in changes.items():
-        group, _, leaf = name.rpartition(".")
-        before = stored[group].get(leaf) if group else stored.get(name)
-        if name not in RESUMABLE and value != before:
-            raise UserError(f"{name}={value} would be another run than {run_folder.path}; only {', '.join(RESUMABLE)} may change")
-    return config
-
-
-def _template(program: Program, num_seeds: int) -> RunState:
-    train = program.state_shape
-    best = Best(Policy(train.params, train.normalizer), jax.eval_shape(lambda: jnp.zeros(num_seeds)))
-    return RunState(train, best)
+    stored = configuration.load(run_folder.config)
+    changed = configuration.change(stored, changes)
+    before, after = configuration.flatten(stored), configuration.flatten(changed)
+    for name in changes:
+        if name not in RESUMABLE and before.get(name) != after.get(name):
+            raise UserError(
+                f"{name}={changes[name]}: {run_folder.path} has {name}={before[name]}, and on resume only "
+                f"{', '.join(RESUMABLE)} may change"
+            )
+    return changed
 
 
 def _compile(display: Display, config: Config) -> tuple[Program, float]:
@@ -147,10 +121,12 @@ def _train(
         log.close()
     training_seconds = time.monotonic() - began
     if stop.signal:
-        display.say(f"{stop.signal.name}: stopped at {line['steps']:,} steps; resume=" f"{run_folder.path} goes on")
+        display.say(f"{stop.signal.name}: stopped at {line['steps']:,} steps; resume={run_folder.path} goes on")
         return 128 + stop.signal
     lines = folder.read_metrics(run_folder)
-    figures.learning_curve(lines, run_folder.learning_curve, title=f"{config.choices['algo']} on {config.choices['env']}")
+    figures.learning_curve(
+        lines, run_folder.learning_curve, title=f"{config.choices['algo']} on {config.choices['env']}"
+    )
     rate = (update - first) * schedule.steps_per_update * config.run.num_seeds / training_seconds
     display.table(_closing_rows(lines, run_folder, rate, compile_seconds, training_seconds))
     return 0
@@ -180,21 +156,12 @@ def _summary(metrics: Metrics) -> dict[str, Any]:
 
 def _evaluate(program: Program, state: RunState) -> tuple[RunState, dict[str, Any]]:
     """The deterministic policy's results, and the state with the best policy kept."""
-    policy = Policy(state.train.params, state.train.normalizer)
-    episodes: Episodes = program.evaluate(policy)
+    policy = current_policy(state.train)
+    episodes = program.evaluate(policy)
     mean_return = episodes.episode_return.mean(axis=-1)
     results = {"return": mean_return} | {name: value.mean(axis=-1) for name, value in episodes.metrics.items()}
-    best = _better(state.best, Best(policy, mean_return))
+    best = better(state.best, Best(policy, mean_return))
     return state._replace(best=best), {f"eval_{name}": jsonable(value) for name, value in results.items()}
-
-
-def _better(old: Best, new: Best) -> Best:
-    improved = new.episode_return > old.episode_return  # a NaN is no improvement
-
-    def choose(a: jax.Array, b: jax.Array) -> jax.Array:
-        return jnp.where(improved.reshape(improved.shape + (1,) * (a.ndim - 1)), a, b)
-
-    return jax.tree.map(choose, new, old)
 
 
 def _closing_rows(

@@ -1,0 +1,46 @@
+"""Complete episodes of a stored policy, in its own environment or in Gymnasium's."""
+
+from __future__ import annotations
+
+import jax
+import numpy as np
+
+import envs
+from jaxpg.evaluation import evaluate
+from jaxpg.run.errors import UserError
+from jaxpg.run.policies import StoredPolicy
+
+Results = tuple[np.ndarray, dict[str, np.ndarray]]  # returns [N], metrics of the last step [N] by name
+
+
+def play_own(stored: StoredPolicy, num_episodes: int, seed: int) -> Results:
+    """Episodes in the environment that the policy was trained on; the seed fixes the starts."""
+    play = jax.jit(lambda key: evaluate(stored.env, stored.act, key, num_episodes, stored.config.env.episode_length))
+    episodes = play(jax.random.key(seed))
+    metrics = {name: np.asarray(values) for name, values in episodes.metrics.items()}
+    return np.asarray(episodes.episode_return, np.float64), metrics
+
+
+def play_gymnasium(stored: StoredPolicy, num_episodes: int, seed: int) -> Results:
+    """Episodes in Gymnasium's Pendulum-v1, started with the seeds seed, seed + 1, ...
+
+    Raises:
+      UserError: another environment than the pendulum with Gymnasium's constants, or Gymnasium is not installed.
+    """
+    if stored.config.choices["env"] != "pendulum" or stored.config.env != envs.REGISTRY["pendulum"].config():
+        raise UserError("backend=gymnasium plays Pendulum-v1: it takes runs of env=pendulum with its default options")
+    try:
+        import gymnasium
+    except ImportError:
+        raise UserError("backend=gymnasium needs Gymnasium: pip install gymnasium") from None
+    pendulums = gymnasium.make_vec("Pendulum-v1", num_envs=num_episodes, vectorization_mode="sync")
+    limit = pendulums.single_action_space.high
+    act = jax.jit(stored.act)
+    obs, _ = pendulums.reset(seed=seed)
+    returns = np.zeros(num_episodes)
+    truncated = np.zeros(num_episodes, bool)
+    while not truncated.all():  # Pendulum-v1 never terminates: all episodes end together at its time limit
+        obs, reward, _, truncated, _ = pendulums.step(limit * np.asarray(act(obs)))
+        returns += reward
+    pendulums.close()
+    return returns, {}

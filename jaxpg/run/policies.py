@@ -1,0 +1,75 @@
+"""The policies of a run, read back from its folder."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from jaxpg.actor_critic import deterministic_policy
+from jaxpg.run import config as configuration
+from jaxpg.run import folder
+from jaxpg.run.checkpoint import Checkpoints
+from jaxpg.run.config import Config
+from jaxpg.run.errors import UserError
+from jaxpg.run.program import agent_keys, initializer, make_algorithm, make_env, make_networks
+from jaxpg.run.state import Policy, current_policy
+
+
+class StoredPolicy(NamedTuple):
+    """One agent of a run.
+
+    Attributes:
+      act: `act(obs) -> action` in [-1, 1], deterministic.
+      env: the environment, with the changes asked for.
+      config: of the run, with the changes.
+      seed: of the agent.
+      update: updates made when the checkpoint was written.
+    """
+
+    act: Any
+    env: Any
+    config: Config
+    seed: int
+    update: int
+
+
+def load(
+    run: str, which: str = "best", agent: int | None = None, changes: Mapping[str, Any] | None = None
+) -> StoredPolicy:
+    """A policy from a run folder.
+
+    Args:
+      run: the folder.
+      which: "best" (by the evaluations while training) or "last".
+      agent: which of the run's agents, from 0; None takes the one with the best evaluation.
+      changes: options to change, by dotted name; `env.*` alone makes sense here.
+
+    Raises:
+      UserError: no run folder, no checkpoint in it, or no such agent.
+    """
+    run_folder = folder.find(run)
+    config = configuration.change(configuration.load(run_folder.config), changes or {})
+    env = make_env(config)
+    shape = jax.eval_shape(initializer(config, make_algorithm(config, env)), agent_keys(config))
+    best, update = _restore(Checkpoints(run_folder.best), shape.best, run)
+    if agent is None:
+        agent = int(jnp.argmax(best.episode_return))
+    if not 0 <= agent < config.run.num_seeds:
+        raise UserError(f"agent={agent}: the run has agents 0 to {config.run.num_seeds - 1}")
+    policy: Policy = best.policy
+    if which == "last":
+        state, update = _restore(Checkpoints(run_folder.checkpoints), shape, run)
+        policy = current_policy(state.train)
+    policy = jax.tree.map(lambda x: x[agent], policy)
+    act = deterministic_policy(make_networks(config, env), policy.params, policy.normalizer)
+    return StoredPolicy(act, env, config, config.run.seed + agent, update)
+
+
+def _restore(checkpoints: Checkpoints, template: Any, run: str) -> tuple[Any, int]:
+    update = checkpoints.latest()
+    if update is None:
+        raise UserError(f"{run} has no checkpoint yet")
+    return checkpoints.restore(update, template), update

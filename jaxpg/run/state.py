@@ -1,0 +1,61 @@
+"""What a run keeps: the training state and the best policy of each agent."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from jaxpg.normalization import RunningStatistics
+from jaxpg.types import PyTree, TrainState
+
+
+class Policy(NamedTuple):
+    """What acting needs.
+
+    Attributes:
+      params: `{"actor": ..., "critic": ...}`.
+      normalizer: statistics of the observations.
+    """
+
+    params: PyTree
+    normalizer: RunningStatistics
+
+
+class Best(NamedTuple):
+    """The best policy of each agent, by its mean evaluation return.
+
+    Attributes:
+      policy: leaves `[S, ...]`.
+      episode_return: `[S]`; -inf before the first evaluation.
+    """
+
+    policy: Policy
+    episode_return: jax.Array
+
+
+class RunState(NamedTuple):
+    """What a checkpoint holds; all leaves have the agents as leading axis, `[S, ...]`."""
+
+    train: TrainState
+    best: Best
+
+
+def start(train: TrainState) -> RunState:
+    """The state before anything has been evaluated; also of shapes alone, under `jax.eval_shape`."""
+    return RunState(train, Best(current_policy(train), jnp.full(train.update.shape, -jnp.inf)))
+
+
+def current_policy(train: TrainState) -> Policy:
+    return Policy(train.params, train.normalizer)
+
+
+def better(old: Best, new: Best) -> Best:
+    """Agent by agent the policy with the higher return; of equals the old one, and a NaN is not higher."""
+    improved = new.episode_return > old.episode_return
+
+    def choose(a: jax.Array, b: jax.Array) -> jax.Array:
+        return jnp.where(improved.reshape(improved.shape + (1,) * (a.ndim - 1)), a, b)
+
+    return jax.tree.map(choose, new, old)

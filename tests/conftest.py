@@ -1,0 +1,43 @@
+"""Shared by all tests: strict JAX settings, a compilation cache for the session, and how commands are run."""
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import jax
+import pytest
+
+jax.config.update("jax_debug_key_reuse", True)
+
+ROOT = Path(__file__).parent.parent
+
+
+@pytest.fixture(scope="session")
+def command_environment(tmp_path_factory):
+    """The environment of commands under test: they share a compilation cache, so that a program compiles once."""
+    cache = str(tmp_path_factory.mktemp("compilation-cache"))
+    return os.environ | {
+        "JAX_COMPILATION_CACHE_DIR": cache,
+        "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0",
+        "PYTHONIOENCODING": "utf-8",
+        "COLUMNS": "120",
+    }
+
+
+@pytest.fixture(scope="session")
+def command(command_environment):
+    """`command("train", "env=pendulum", ...)` runs `python -m jaxpg.train env=pendulum ...` to its end."""
+
+    def run(verb, *arguments, cwd=ROOT, timeout=600):
+        return subprocess.run(
+            [sys.executable, "-m", f"jaxpg.{verb}", *arguments],
+            cwd=cwd,
+            env=command_environment,
+            capture_output=True,
+            text=True,
+            timeout=timeout,
+            check=False,
+        )
+
+    return run
