@@ -77,4 +77,4 @@ class MjxEnv:
 def initial_state(pipeline_state: Any, obs: jax.Array, metric_names: tuple[str, ...] = ()) -> State:
     """The State after a reset: nothing earned, nothing ended, all metrics 0."""
     zero = jnp.zeros((), obs.dtype)
-    return State(pipeline_state, obs, reward=zero, done=zero, metrics={name: zero for name in metric_names})
+    return State(pipeline_state, obs, reward=zero, done=zero, metrics=dict.fromkeys(metric_names, zero))

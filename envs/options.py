@@ -113,10 +113,13 @@ def convert(hint: Any, value: Any) -> Any:
             raise ValueError("expected a list such as [64,64]")
         return [convert(typing.get_args(hint)[0], element) for element in value]
     is_number = isinstance(value, (int, float)) and not isinstance(value, bool)
-    if hint is int and is_number and float(value).is_integer():
-        return int(value)
-    if hint is float and is_number:
-        return float(value)
+    try:
+        if hint is int and is_number and float(value).is_integer():
+            return int(value)
+        if hint is float and is_number:
+            return float(value)
+    except OverflowError:
+        raise ValueError("this number is too large") from None
     if hint in (bool, str) and isinstance(value, hint):
         return value
     raise ValueError(f"expected {_TYPE_NAMES[hint]}")
@@ -143,8 +146,9 @@ def _check_range(metadata: Mapping[str, Any], value: Any) -> None:
         elif element is None or isinstance(element, bool):
             allowed = True
         else:
-            allowed = math.isfinite(element) and all(
-                compare(element, metadata[key]) for key, compare in _BOUNDS.items() if metadata.get(key) is not None
-            )
+            if not math.isfinite(element):
+                raise ValueError("must be finite")
+            bounds = [(compare, metadata.get(key)) for key, compare in _BOUNDS.items()]
+            allowed = all(compare(element, bound) for compare, bound in bounds if bound is not None)
         if not allowed:
-            raise ValueError(f"must be {describe_range(metadata) or 'finite'}")
+            raise ValueError(f"must be {describe_range(metadata)}")

@@ -56,7 +56,7 @@ def gaussian_entropy(log_std: jax.Array) -> jax.Array:
       log_std: log sigma, `[..., action_size]`.
 
     Returns:
-      `[...]` in nats. The squashed policy's entropy is smaller and has no closed form.
+      `[...]` in nats. The squashed policy's entropy is another, E[log |da/du|] more, without a closed form.
 
     >>> round(float(gaussian_entropy(jnp.zeros(1))), 5)
     1.41894

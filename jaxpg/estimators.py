@@ -24,6 +24,7 @@ import jax
 import jax.numpy as jnp
 
 from jaxpg.returns import discounted_returns, lambda_returns, td_errors
+from jaxpg.shapes import floating, same, spread
 
 
 class Estimate(NamedTuple):
@@ -82,7 +83,7 @@ def reinforce_mean_baseline(
     [0.5, -0.5]
     """
     returns = discounted_returns(reward, discount, 0.0)
-    weight = jnp.broadcast_to(weight, returns.shape)
+    weight = spread(weight, returns, "weight")
     return Estimate(returns - jnp.sum(weight * returns) / jnp.sum(weight), returns)
 
 
@@ -105,9 +106,7 @@ def reinforce_value_baseline(reward: jax.Array, discount: jax.Array | float, val
     [1.0, 0.0]
     """
     returns = discounted_returns(reward, discount, 0.0)
-    if value.shape != returns.shape:
-        raise ValueError(f"value has shape {value.shape}, expected {returns.shape}")
-    return Estimate(returns - value, returns)
+    return Estimate(returns - same(value, returns, "value"), returns)
 
 
 def td_zero(reward: jax.Array, discount: jax.Array | float, value: jax.Array, next_value: jax.Array) -> Estimate:
@@ -144,7 +143,8 @@ def td_lambda(
 
         A_t = G_t^lambda - V(s_t) = delta_t + d_t lambda_t A_{t+1}
 
-    lambda = 0 is `td_zero`; lambda = 1 is Monte Carlo minus value, with a bootstrap at cuts.
+    lambda = 0 is `td_zero`; lambda = 1 is Monte Carlo minus value, with a bootstrap at cuts. The second form holds
+    where lambda_t > 0 only with V(s_{t+1}) = value[t+1], that is, with `next_value` of the same critic.
 
     Args:
       reward: r_t, `[T, ...]`.
@@ -161,30 +161,33 @@ def td_lambda(
     >>> td_lambda(jnp.array([1.0, 1.0]), 1.0, jnp.array([0.0, 1.0]), jnp.array([1.0, 2.0]), 1.0).advantage.tolist()
     [4.0, 2.0]
     """
-    if value.shape != reward.shape:
-        raise ValueError(f"value has shape {value.shape}, expected {reward.shape}")
     returns = lambda_returns(reward, discount, next_value, lambda_)
-    return Estimate(returns - value, returns)
+    return Estimate(returns - same(value, returns, "value"), returns)
 
 
-def normalize_advantages(advantage: jax.Array, weight: jax.Array | float = 1.0, epsilon: float = 1e-8) -> jax.Array:
+def normalize_advantages(advantage: jax.Array, weight: jax.Array | float = 1.0, epsilon: float = 3e-5) -> jax.Array:
     """Advantages with mean 0 and standard deviation 1 over the whole batch.
 
-        A'_t = (A_t - mean A) / (std A + epsilon),    with weighted mean and variance
+        A'_t = (A_t - mean A) / sqrt(var A + (epsilon max |A|)^2),    with weighted mean and variance
 
     Args:
       advantage: A_t, `[T, ...]`.
       weight: 1 where the step counts, else 0, `[T, ...]` or a scalar. Entries of weight 0 are shifted too, and
         must be masked again by the loss.
-      epsilon: keeps a constant batch at 0.
+      epsilon: keeps a batch of equal entries, whose mean is right to rounding only, near 0.
+
+    Raises:
+      ValueError: the weight's shape does not fit.
 
     Source: practice; not part of the theorem. It rescales the step, and like every mean over the batch it
     includes the sample itself.
 
-    >>> normalize_advantages(jnp.array([1.0, 3.0])).round(4).tolist()
+    >>> normalize_advantages(jnp.array([1.0, 3.0])).round(3).tolist()
     [-1.0, 1.0]
     """
-    weight = jnp.broadcast_to(weight, advantage.shape)
+    advantage = floating(advantage)
+    weight = spread(weight, advantage, "weight")
     total = jnp.sum(weight)
     centred = advantage - jnp.sum(weight * advantage) / total
-    return centred / (jnp.sqrt(jnp.sum(weight * centred**2) / total) + epsilon)
+    variance = jnp.sum(weight * centred**2) / total + (epsilon * jnp.max(jnp.abs(weight * advantage))) ** 2
+    return centred / jnp.sqrt(jnp.maximum(variance, jnp.finfo(advantage.dtype).tiny))

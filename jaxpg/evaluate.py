@@ -43,10 +43,8 @@ def main(arguments: Sequence[str]) -> int:
     play = episodes.play_gymnasium if options.backend == "gymnasium" else episodes.play_own
     returns, metrics = play(stored, options.episodes, options.seed)
     mean, stderr = returns.mean(), returns.std(ddof=1) / math.sqrt(len(returns))
-    name = stored.config.choices["env"]
-    print(
-        f"{name}, seed {stored.seed}, {options.checkpoint} policy (saved after {stored.update:,} updates), {options.backend}"
-    )
+    saved = f"{options.checkpoint} policy (saved after {stored.update:,} updates)"
+    print(f"{stored.config.choices['env']}, seed {stored.seed}, {saved}, {options.backend}")
     print(f"return   {mean:.2f} +- {stderr:.2f} (mean and standard error, {len(returns)} episodes)")
     for metric, values in metrics.items():
         print(

@@ -10,6 +10,8 @@ from __future__ import annotations
 import jax
 import jax.numpy as jnp
 
+from jaxpg.shapes import same, spread
+
 
 def policy_gradient_loss(log_prob: jax.Array, advantage: jax.Array, weight: jax.Array | float = 1.0) -> jax.Array:
     """Surrogate whose gradient is minus the estimated policy gradient.
@@ -30,8 +32,8 @@ def policy_gradient_loss(log_prob: jax.Array, advantage: jax.Array, weight: jax.
     >>> policy_gradient_loss(jnp.array([-1.0, -2.0]), jnp.array([1.0, 3.0])).item()
     3.5
     """
-    _check_same_shape(log_prob=log_prob, advantage=advantage)
-    return -jnp.mean(weight * log_prob * jax.lax.stop_gradient(advantage))
+    weight = spread(weight, log_prob, "weight")
+    return -jnp.mean(weight * log_prob * jax.lax.stop_gradient(same(advantage, log_prob, "advantage")))
 
 
 def value_loss(value: jax.Array, target: jax.Array, weight: jax.Array | float = 1.0) -> jax.Array:
@@ -54,8 +56,8 @@ def value_loss(value: jax.Array, target: jax.Array, weight: jax.Array | float = 
     >>> value_loss(jnp.array([1.0, 2.0]), jnp.array([0.0, 4.0])).item()
     1.25
     """
-    _check_same_shape(value=value, target=target)
-    return 0.5 * jnp.mean(weight * (value - jax.lax.stop_gradient(target)) ** 2)
+    weight = spread(weight, value, "weight")
+    return 0.5 * jnp.mean(weight * (value - jax.lax.stop_gradient(same(target, value, "target"))) ** 2)
 
 
 def entropy_loss(entropy: jax.Array, weight: jax.Array | float = 1.0) -> jax.Array:
@@ -67,15 +69,12 @@ def entropy_loss(entropy: jax.Array, weight: jax.Array | float = 1.0) -> jax.Arr
       entropy: H_t of the policy at s_t, `[T, ...]`, differentiable.
       weight: as in `policy_gradient_loss`.
 
+    Raises:
+      ValueError: the shapes differ.
+
     Source: Mnih et al., arXiv 1602.01783, section 4.
 
     >>> entropy_loss(jnp.array([1.0, 3.0])).item()
     -2.0
     """
-    return -jnp.mean(weight * entropy)
-
-
-def _check_same_shape(**arrays: jax.Array) -> None:
-    (first, a), (second, b) = arrays.items()
-    if a.shape != b.shape:
-        raise ValueError(f"{first} has shape {a.shape} but {second} has shape {b.shape}")
+    return -jnp.mean(spread(weight, entropy, "weight") * entropy)

@@ -40,8 +40,41 @@ class MLP(nn.Module):
     @nn.compact
     def __call__(self, x: jax.Array) -> jax.Array:
         for width in self.widths:
-            x = self.activation(nn.Dense(width, kernel_init=nn.initializers.orthogonal(2.0**0.5))(x))
-        return nn.Dense(self.output_size, kernel_init=nn.initializers.orthogonal(self.output_gain))(x)
+            x = self.activation(nn.Dense(width, kernel_init=orthogonal(2.0**0.5))(x))
+        return nn.Dense(self.output_size, kernel_init=orthogonal(self.output_gain))(x)
+
+
+def orthogonal(gain: float) -> nn.initializers.Initializer:
+    """Weights drawn uniformly from the matrices with orthonormal rows or columns, times `gain`.
+
+    Gram-Schmidt on a Gaussian matrix; flax's initializer of the same name asks LAPACK for a QR decomposition, and
+    batched LAPACK calls, which `vmap` over seeds would make of it, hang on some jaxlib releases.
+
+    Source: Saxe, McClelland and Ganguli, arXiv 1312.6120.
+
+    >>> weights = orthogonal(2.0)(jax.random.key(0), (3, 2))
+    >>> bool(jnp.allclose(weights.T @ weights, 4 * jnp.eye(2), atol=1e-5))
+    True
+    """
+
+    def init(key, shape, dtype=jnp.float32):
+        tall = (max(shape), min(shape))
+        columns = gain * _orthonormalize(jax.random.normal(key, tall, dtype))
+        return columns if shape == tall else columns.T
+
+    return init
+
+
+def _orthonormalize(a: jax.Array) -> jax.Array:
+    """Orthonormal columns spanning the same spaces as the first 1, 2, ... columns of `a`, `[n, m]` with n >= m."""
+
+    def step(q, i):
+        column = a[:, i]
+        for _ in range(2):  # once loses orthogonality to rounding; twice is enough
+            column = column - q @ (q.T @ column)
+        return q.at[:, i].set(column / jnp.linalg.norm(column)), None
+
+    return jax.lax.scan(step, jnp.zeros_like(a), jnp.arange(a.shape[1]))[0]
 
 
 class GaussianActor(nn.Module):

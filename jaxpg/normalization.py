@@ -25,7 +25,7 @@ class RunningStatistics(NamedTuple):
 def init(size: int) -> RunningStatistics:
     """No samples yet: mean 0 and variance 1, so that `normalize` is the identity.
 
-    >>> normalize(init(2), jnp.array([3.0, 4.0])).tolist()
+    >>> normalize(init(2), jnp.array([3.0, 4.0])).round(3).tolist()
     [3.0, 4.0]
     """
     return RunningStatistics(jnp.zeros(()), jnp.zeros(size), jnp.ones(size))
@@ -60,7 +60,8 @@ def update(statistics: RunningStatistics, batch: jax.Array) -> RunningStatistics
 def normalize(statistics: RunningStatistics, x: jax.Array, epsilon: float = 1e-6) -> jax.Array:
     """(x - mean) / sqrt(variance + epsilon), `[..., size]`; a constant component becomes 0.
 
-    >>> normalize(RunningStatistics(jnp.array(2.0), jnp.array([1.0]), jnp.array([4.0])), jnp.array([5.0])).round(3).tolist()
+    >>> statistics = RunningStatistics(jnp.array(2.0), jnp.array([1.0]), jnp.array([4.0]))
+    >>> normalize(statistics, jnp.array([5.0])).round(3).tolist()
     [2.0]
     """
     return (x - statistics.mean) * jax.lax.rsqrt(statistics.variance + epsilon)

@@ -10,6 +10,8 @@ from __future__ import annotations
 import jax
 import jax.numpy as jnp
 
+from jaxpg.shapes import floating, spread
+
 
 def discounted_returns(reward: jax.Array, discount: jax.Array | float, bootstrap: jax.Array | float) -> jax.Array:
     """Discounted sum of the rewards to come (reward-to-go).
@@ -32,8 +34,9 @@ def discounted_returns(reward: jax.Array, discount: jax.Array | float, bootstrap
     >>> discounted_returns(jnp.array([1.0, 1.0, 1.0]), 0.5, 8.0).tolist()
     [2.75, 3.5, 5.0]
     """
-    discount = _like(reward, discount, "discount")
-    bootstrap = _like(reward[0], bootstrap, "bootstrap")
+    reward = floating(reward)
+    discount = spread(discount, reward, "discount")
+    bootstrap = spread(bootstrap, reward[0], "bootstrap")
     return _backward(reward, discount, bootstrap)
 
 
@@ -59,8 +62,9 @@ def td_errors(reward: jax.Array, discount: jax.Array | float, value: jax.Array, 
     >>> td_errors(jnp.array([1.0]), 0.5, jnp.array([2.0]), jnp.array([4.0])).tolist()
     [1.0]
     """
-    discount = _like(reward, discount, "discount")
-    return reward + discount * _like(reward, next_value, "next_value") - _like(reward, value, "value")
+    reward = floating(reward)
+    discount = spread(discount, reward, "discount")
+    return reward + discount * spread(next_value, reward, "next_value") - spread(value, reward, "value")
 
 
 def n_step_returns(
@@ -97,9 +101,10 @@ def n_step_returns(
     """
     if n < 1:
         raise ValueError(f"n must be at least 1, got {n}")
-    discount = _like(reward, discount, "discount")
-    next_value = _like(reward, next_value, "next_value")
-    continues = _like(reward, continues, "continues")
+    reward = floating(reward)
+    discount = spread(discount, reward, "discount")
+    next_value = spread(next_value, reward, "next_value")
+    continues = spread(continues, reward, "continues")
     returns = reward + discount * next_value
     for _ in range(min(n, len(reward)) - 1):
         following = jnp.concatenate([returns[1:], next_value[-1:]])
@@ -138,9 +143,10 @@ def lambda_returns(
     >>> lambda_returns(jnp.array([1.0, 1.0]), 0.5, jnp.array([4.0, 8.0]), 0.5).tolist()
     [3.25, 5.0]
     """
-    discount = _like(reward, discount, "discount")
-    next_value = _like(reward, next_value, "next_value")
-    lambda_ = _like(reward, lambda_, "lambda_")
+    reward = floating(reward)
+    discount = spread(discount, reward, "discount")
+    next_value = spread(next_value, reward, "next_value")
+    lambda_ = spread(lambda_, reward, "lambda_")
     return _backward(reward + discount * (1 - lambda_) * next_value, discount * lambda_, next_value[-1])
 
 
@@ -153,11 +159,3 @@ def _backward(term: jax.Array, factor: jax.Array, last: jax.Array) -> jax.Array:
         return current, current
 
     return jax.lax.scan(step, last, (term, factor), reverse=True)[1]
-
-
-def _like(reference: jax.Array, x: jax.Array | float, name: str) -> jax.Array:
-    """`x` in the reference's shape and type: a scalar is spread, any other shape must be the reference's."""
-    x = jnp.asarray(x, reference.dtype)
-    if x.shape not in ((), reference.shape):
-        raise ValueError(f"{name} has shape {x.shape}, expected {reference.shape} or a scalar")
-    return jnp.broadcast_to(x, reference.shape)

@@ -3,10 +3,10 @@
 import jax
 import jax.numpy as jnp
 import numpy as np
+from probes import Counter
 
 from jaxpg.rollout import rollout
 from jaxpg.vector_env import stagger, vectorize
-from probes import Counter
 
 
 def play(env, num_envs, episode_length, length, seed=0, staggered=False):

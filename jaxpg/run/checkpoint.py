@@ -63,9 +63,13 @@ class Checkpoints:
             self._manager.delete(later)
         self.save(step, tree, meta)
 
-    def restore_meta(self, step: int) -> dict[str, Any]:
-        """The JSON object of checkpoint `step`; raises CheckpointError if it cannot be read."""
-        return self._record(step)["meta"]
+    def record(self, step: int) -> dict[str, Any]:
+        """What was written beside the arrays: `meta`, and `leaves`, name -> [shape, type, SHA-256].
+
+        Raises:
+          CheckpointError: it cannot be read.
+        """
+        return self._read(step, meta=ocp.args.JsonRestore())["meta"]
 
     def restore(self, step: int, template: PyTree) -> PyTree:
         """The tree of checkpoint `step`, every leaf verified.
@@ -77,7 +81,7 @@ class Checkpoints:
         Raises:
           CheckpointError: it cannot be read, was made by another program, or its content is damaged.
         """
-        recorded = self._record(step)["leaves"]
+        recorded = self.record(step)["leaves"]
         paths, structure = jax.tree_util.tree_flatten_with_path(template)
         expected = {_name(path): leaf for path, leaf in paths}
         self._check_same_program(step, recorded, expected)
@@ -105,9 +109,6 @@ class Checkpoints:
                     f"{self.folder / str(step)}: made by another program: {name} is {saved[1]}{saved[0]} there, "
                     f"{ours.dtype}{list(ours.shape)} here"
                 )
-
-    def _record(self, step: int) -> dict[str, Any]:
-        return self._read(step, meta=ocp.args.JsonRestore())["meta"]
 
     def _read(self, step: int, **items: Any) -> Any:
         try:

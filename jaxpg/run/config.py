@@ -310,7 +310,7 @@ def help_text(arguments: Sequence[str]) -> str:
         lines.append(f"  {name}={_shown(values[name])}".ljust(38) + describe(field))
     lines += [
         "",
-        "Values shown are the defaults for the environment and the algorithm named above: add env=... or algo=... to see others.",
+        "Shown are the defaults for the environment and the algorithm named above; add env=... or algo=... for others.",
     ]
     return "\n".join(lines)
 

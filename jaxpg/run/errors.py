@@ -21,6 +21,9 @@ def run_command(main: Callable[[Sequence[str]], int | None]) -> None:
         status = _report(error.problems)
     except (UserError, MujocoModelError) as error:
         status = _report([str(error)])
+    except KeyboardInterrupt:
+        print("interrupted", file=sys.stderr)
+        status = 130
     sys.exit(status)
 
 

@@ -128,10 +128,9 @@ def make_optimizer(config: Config) -> optax.GradientTransformation:
     )
 
 
-def compile_program(config: Config) -> Program:
-    """Traces and compiles the training chunk and the evaluation; the two compile side by side."""
+def compile_program(config: Config, env: Any) -> Program:
+    """Traces and compiles the training chunk and the evaluation in `env`; the two compile side by side."""
     run, schedule = config.run, plan(config)
-    env = make_env(config)
     networks, algorithm = make_networks(config, env), make_algorithm(config, env)
     keys = agent_keys(config)
 

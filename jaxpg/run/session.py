@@ -14,7 +14,7 @@ from jaxpg.run.checkpoint import Checkpoints
 from jaxpg.run.config import Config
 from jaxpg.run.errors import UserError
 from jaxpg.run.folder import MetricsLog, RunFolder, jsonable
-from jaxpg.run.program import Program, compile_program, plan
+from jaxpg.run.program import Program, compile_program, make_env, plan
 from jaxpg.run.runtime import StopRequests, prepare
 from jaxpg.run.state import Best, RunState, better, current_policy
 from jaxpg.run.terminal import Display, shown
@@ -27,6 +27,7 @@ RESUMABLE = ("total_steps", "log_interval", "eval_interval", "checkpoint_interva
 def begin(config: Config) -> int:
     """Trains from the beginning; returns the exit status."""
     prepare(config)
+    env = make_env(config)  # before anything is written: it may have a mistake to report
     run_folder, schedule = folder.create(config), plan(config)
     configuration.save(config, run_folder.config)
     display = Display(schedule.total_steps)
@@ -36,7 +37,7 @@ def begin(config: Config) -> int:
         f"{algo} on {config.choices['env']}, {agents}: {run.num_envs} environments x {run.num_steps} steps x "
         f"{schedule.num_updates:,} updates = {schedule.total_steps:,} steps, into {run_folder.path}"
     )
-    program, seconds = _compile(display, config)
+    program, seconds = _compile(display, config, env)
     return _train(config, run_folder, display, program, program.init(), seconds)
 
 
@@ -54,6 +55,7 @@ def resume(given: Mapping[str, Any]) -> int:
     schedule = plan(config)
     display = Display(schedule.total_steps, steps=update * schedule.steps_per_update)
     if update >= schedule.num_updates:
+        _draw(config, run_folder)
         display.say(f"{run_folder.path} is finished; a larger total_steps goes on")
         return 0
     display.say(
@@ -62,7 +64,7 @@ def resume(given: Mapping[str, Any]) -> int:
     for name, now in folder.versions().items():
         if recorded.get(name) != now:
             display.say(f"note: {name} was {recorded.get(name)} and is {now}: the same run, but not the same bits")
-    program, seconds = _compile(display, config)
+    program, seconds = _compile(display, config, make_env(config))
     state = checkpoints.restore(update, program.state_shape)
     configuration.save(config, run_folder.config)
     return _train(config, run_folder, display, program, state, seconds)
@@ -82,10 +84,10 @@ def _changed(run_folder: RunFolder, changes: Mapping[str, Any]) -> Config:
     return changed
 
 
-def _compile(display: Display, config: Config) -> tuple[Program, float]:
+def _compile(display: Display, config: Config, env: Any) -> tuple[Program, float]:
     display.say("compiling ...")
     began = time.monotonic()
-    program = compile_program(config)
+    program = compile_program(config, env)
     seconds = time.monotonic() - began
     display.say(f"compiled in {seconds:.1f} s")
     return program, seconds
@@ -119,17 +121,22 @@ def _train(
     finally:
         display.stop()
         log.close()
-    training_seconds = time.monotonic() - began
-    if stop.signal:
+    if update < schedule.num_updates:
         display.say(f"{stop.signal.name}: stopped at {line['steps']:,} steps; resume={run_folder.path} goes on")
         return 128 + stop.signal
-    lines = folder.read_metrics(run_folder)
-    figures.learning_curve(
-        lines, run_folder.learning_curve, title=f"{config.choices['algo']} on {config.choices['env']}"
-    )
+    training_seconds = time.monotonic() - began
     rate = (update - first) * schedule.steps_per_update * config.run.num_seeds / training_seconds
+    lines = _draw(config, run_folder)
     display.table(_closing_rows(lines, run_folder, rate, compile_seconds, training_seconds))
     return 0
+
+
+def _draw(config: Config, run_folder: RunFolder) -> list[dict[str, Any]]:
+    """Draws the learning curve; returns the lines of metrics that it shows."""
+    lines = folder.read_metrics(run_folder)
+    title = f"{config.choices['algo']} on {config.choices['env']}"
+    figures.learning_curve(lines, run_folder.learning_curve, title)
+    return lines
 
 
 class _Keeper:

@@ -1,0 +1,62 @@
+"""Claim: the default commands solve the pendulum and the arm in minutes on two cores.
+
+    python experiments/default_runs.py [pendulum] [arm]
+
+Pendulum: the default run for seeds 0 to 4 and the same with TD(0), each evaluated over 200 episodes of Gymnasium's own
+Pendulum-v1. Arm: the default run for seeds 0 to 2, and one run for each kind of control, plane and reward, each
+evaluated over 500 episodes. Writes results/default_runs_pendulum.json and results/default_runs_arm.json.
+"""
+
+from __future__ import annotations
+
+import itertools
+import sys
+import tempfile
+from pathlib import Path
+
+from commands import evaluate, train, write_json
+
+PENDULUM_SEEDS = range(5)
+PENDULUM_RUNS = {"default": (), "TD(0)": ("algo.lambda_=0",)}
+ARM_RUNS = [{"seed": str(seed)} for seed in range(3)] + [
+    {"env.control": control, "env.gravity": gravity, "env.reward": reward}
+    for control, gravity, reward in itertools.product(("torque", "velocity"), ("false", "true"), ("lesson", "precise"))
+    if (control, gravity, reward) != ("torque", "false", "lesson")
+]
+
+
+def pendulum(folder: Path) -> None:
+    rows = []
+    for name, options in PENDULUM_RUNS.items():
+        for seed in PENDULUM_SEEDS:
+            run = folder / f"pendulum-{name}-{seed}"
+            seconds = train(run, "env=pendulum", f"seed={seed}", *options)
+            found = evaluate(run, "episodes=200", "backend=gymnasium")
+            rows.append({"run": name, "seed": seed, "seconds": round(seconds, 1), **found})
+            print(rows[-1], flush=True)
+    write_json("default_runs_pendulum.json", rows)
+
+
+def arm(folder: Path) -> None:
+    rows = []
+    for number, options in enumerate(ARM_RUNS):
+        run = folder / f"arm-{number}"
+        seconds = train(run, "env=arm", *(f"{name}={value}" for name, value in options.items()))
+        found = evaluate(run, "episodes=500")
+        closer = evaluate(run, "episodes=500", "env.success_radius=0.02")
+        success = {"within_5cm": found["success"], "within_2cm": closer["success"]}
+        rows.append(
+            {**options, "seconds": round(seconds, 1), **success, "mean": found["mean"], "stderr": found["stderr"]}
+        )
+        print(rows[-1], flush=True)
+    write_json("default_runs_arm.json", rows)
+
+
+def main(tasks: list[str]) -> None:
+    with tempfile.TemporaryDirectory() as folder:
+        for task in tasks or ["pendulum", "arm"]:
+            {"pendulum": pendulum, "arm": arm}[task](Path(folder))
+
+
+if __name__ == "__main__":
+    main(sys.argv[1:])

@@ -1,0 +1,41 @@
+"""One rule for shapes: a scalar is spread over the other array, any other shape must be the same.
+
+Without it `[N]` against `[N, 1]` would be spread in silence to `[N, N]`.
+"""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+
+
+def floating(x: jax.Array) -> jax.Array:
+    """`x` as an array of floating-point numbers: integers would round discounts to 0."""
+    return jnp.asarray(x, jnp.result_type(x, 0.0))
+
+
+def spread(x: jax.Array | float, reference: jax.Array, name: str) -> jax.Array:
+    """`x` in the reference's shape and type.
+
+    Args:
+      x: a scalar, or an array of the reference's shape.
+      reference: `[...]`.
+      name: what x is called in the message.
+
+    Raises:
+      ValueError: x has another shape.
+
+    >>> spread(0.5, jnp.ones(2), "discount").tolist()
+    [0.5, 0.5]
+    """
+    x = jnp.asarray(x, reference.dtype)
+    if x.shape not in ((), reference.shape):
+        raise ValueError(f"{name} has shape {x.shape}, expected {reference.shape} or a scalar")
+    return jnp.broadcast_to(x, reference.shape)
+
+
+def same(x: jax.Array, reference: jax.Array, name: str) -> jax.Array:
+    """`x`, which must have the reference's shape; raises ValueError where it has another."""
+    if x.shape != reference.shape:
+        raise ValueError(f"{name} has shape {x.shape}, expected {reference.shape}")
+    return x

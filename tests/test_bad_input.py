@@ -1,0 +1,187 @@
+"""Mistakes end in one clear line, status 2, and nothing written."""
+
+import json
+import shutil
+import sys
+
+import pytest
+
+from jaxpg import evaluate, train
+from jaxpg.run.errors import run_command
+
+MISTAKES = {
+    "unknown option": (["lerning_rate=3"], "unknown option 'lerning_rate'"),
+    "misspelt option": (["algo.gama=0.9"], "unknown option 'algo.gama': did you mean 'algo.gamma'?"),
+    "option without its group": (["gamma=0.9"], "unknown option 'gamma': did you mean 'algo.gamma'?"),
+    "misspelt environment": (["env=pendulm"], "unknown env 'pendulm': did you mean 'pendulum'?"),
+    "misspelt algorithm": (["algo=reinforc"], "unknown algo 'reinforc': did you mean 'reinforce'?"),
+    "unknown algorithm": (["algo=xyz"], "unknown algo 'xyz': known are reinforce, td"),
+    "option of another algorithm": (["algo.baseline=mean"], "unknown option 'algo.baseline'"),
+    "option of another environment": (["env.goal_min=0.3"], "unknown option 'env.goal_min'"),
+    "word for a number": (["num_envs=many"], "num_envs=many: expected a whole number"),
+    "fraction for a count": (["num_envs=2.5"], "num_envs=2.5: expected a whole number"),
+    "number for a switch": (["network.learn_sigma=1"], "network.learn_sigma=1: expected true or false"),
+    "number for a list": (["network.widths=64"], "network.widths=64: expected a list such as [64,64]"),
+    "unknown choice": (["network.activation=gelu"], "must be tanh or relu or elu or swish"),
+    "zero environments": (["num_envs=0"], "num_envs=0: must be at least 1"),
+    "zero width": (["network.widths=[64,0]"], "must be at least 1"),
+    "negative steps": (["total_steps=-5"], "total_steps=-5: must be at least 1"),
+    "negative step size": (["algo.actor_lr=-0.1"], "algo.actor_lr=-0.1: must be above 0"),
+    "step size that is no number": (["algo.actor_lr=nan"], "algo.actor_lr=nan: must be finite"),
+    "infinite step size": (["algo.actor_lr=inf"], "algo.actor_lr=inf: must be finite"),
+    "discount above 1": (["algo.gamma=1.5"], "algo.gamma=1.5: must be at least 0, at most 1"),
+    "lambda below 0": (["algo.lambda_=-0.5"], "algo.lambda_=-0.5: must be at least 0, at most 1"),
+    "negative seed": (["seed=-1"], "seed=-1: must be at least 0, at most 4294967295"),
+    "seed of 33 bits": (["seed=4294967296"], "must be at least 0, at most 4294967295"),
+    "seeds beyond 32 bits": (["seed=4294967295", "num_seeds=2"], "seeds must stay below 2**32"),
+    "negative mass": (["env.mass=-1"], "env.mass=-1: must be above 0"),
+    "rollout length of whole episodes": (["algo=reinforce", "num_steps=10"], "algo=reinforce plays whole episodes"),
+    "goal out of reach": (["env=arm", "env.goal_max=2"], "goals must lie in the reachable ring"),
+    "unknown brax environment": (
+        ["env=brax", "env.name=reachr"],
+        "unknown brax environment 'reachr': did you mean 'reacher'?",
+    ),
+    "no equals sign": (["seed"], "'seed': expected name=value"),
+    "stray flag": (["--fast"], "'--fast': expected name=value"),
+    "unbalanced bracket": (["network.widths=[64"], "expected name=value"),
+    "sweep": (["seed=1,2"], "expected name=value"),
+    "given twice": (["seed=1", "seed=2"], "seed is given twice"),
+    "no run folder to resume": (
+        ["resume=/nowhere/at/all"],
+        "/nowhere/at/all is not a run folder: it has no config.yaml",
+    ),
+}
+
+
+def run(main, arguments, monkeypatch, capsys):
+    """Exit status and standard error of a command."""
+    monkeypatch.setattr(sys, "argv", ["jaxpg", *arguments])
+    with pytest.raises(SystemExit) as exit_:
+        run_command(main)
+    return exit_.value.code, capsys.readouterr().err
+
+
+@pytest.mark.parametrize("mistake", MISTAKES)
+def test_mistakes_in_training_options(mistake, monkeypatch, capsys, tmp_path):
+    arguments, message = MISTAKES[mistake]
+    if not arguments[0].startswith("resume"):
+        arguments = [*arguments, f"run_dir={tmp_path / 'run'}"]
+    status, error = run(train.main, arguments, monkeypatch, capsys)
+    assert status == 2
+    assert message in error
+    assert error.startswith("error: ")
+    assert len(error.splitlines()) == 1
+    assert not (tmp_path / "run").exists()
+
+
+@pytest.fixture(scope="module")
+def finished(command, tmp_path_factory):
+    folder = tmp_path_factory.mktemp("runs") / "finished"
+    sizes = ("num_envs=2", "num_steps=2", "total_steps=4", "eval_episodes=2", "env.episode_length=4")
+    assert command("train", *sizes, f"run_dir={folder}").returncode == 0
+    return folder
+
+
+def tree(folder):
+    """All files below a folder with their contents."""
+    return {path.relative_to(folder): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+
+
+RUN_MISTAKES = {
+    "folder in use": (train, ["run_dir={run}"], "is not empty: take another run_dir, or resume="),
+    "folder below a file": (train, ["run_dir={run}/config.yaml/x"], "cannot write a run folder there"),
+    "another environment": (train, ["resume={run}", "env=arm"], "env=arm: the run has env=pendulum"),
+    "another network": (
+        train,
+        ["resume={run}", "network.widths=[32]"],
+        "has network.widths=[64, 64], and on resume only",
+    ),
+    "another seed": (train, ["resume={run}", "seed=3"], "has seed=0, and on resume only"),
+    "misspelt on resume": (train, ["resume={run}", "totl_steps=9"], "did you mean 'total_steps'?"),
+    "no run": (evaluate, [], "run=DIR is missing"),
+    "folder that is no run": (evaluate, ["run={run}/tb"], "is not a run folder"),
+    "misspelt backend": (evaluate, ["run={run}", "backend=gym"], "must be mjx or gymnasium"),
+    "misspelt evaluation option": (evaluate, ["run={run}", "episode=3"], "did you mean 'episodes'?"),
+    "one episode": (evaluate, ["run={run}", "episodes=1"], "episodes=1: must be at least 2"),
+    "no such agent": (evaluate, ["run={run}", "agent=1"], "agent=1: the run has agents 0 to 0"),
+    "gymnasium with another pendulum": (
+        evaluate,
+        ["run={run}", "backend=gymnasium"],
+        "runs of env=pendulum with its default",
+    ),
+}
+
+
+@pytest.mark.parametrize("mistake", RUN_MISTAKES)
+def test_mistakes_about_a_run(mistake, finished, monkeypatch, capsys):
+    module, arguments, message = RUN_MISTAKES[mistake]
+    before = tree(finished)
+    status, error = run(module.main, [argument.format(run=finished) for argument in arguments], monkeypatch, capsys)
+    assert status == 2
+    assert message in error
+    assert len(error.splitlines()) == 1
+    assert tree(finished) == before
+
+
+def damaged(finished, tmp_path, damage):
+    folder = tmp_path / "run"
+    shutil.copytree(finished, folder)
+    damage(folder)
+    return folder
+
+
+def flip_a_bit(folder):
+    """In the largest file of the newest checkpoint's arrays."""
+    largest = max((folder / "checkpoints").rglob("d/*"), key=lambda path: path.stat().st_size)
+    content = bytearray(largest.read_bytes())
+    content[len(content) // 2] ^= 1
+    largest.write_bytes(content)
+
+
+def edit_config(old, new):
+    def damage(folder):
+        path = folder / "config.yaml"
+        text = path.read_text()
+        assert old in text
+        path.write_text(text.replace(old, new))
+
+    return damage
+
+
+def other_versions(folder):
+    path = folder / "versions.json"
+    path.write_text(path.read_text().replace('"threads"', '"thread'))
+
+
+DAMAGES = {
+    "bit flipped in the arrays": (flip_a_bit, "damaged|cannot be read"),
+    "checkpoints removed": (lambda folder: shutil.rmtree(folder / "checkpoints"), "no checkpoint yet"),
+    "other network in config.yaml": (edit_config("- 64\n  - 64", "- 64\n  - 32"), "made by another program"),
+    "other environment in config.yaml": (edit_config("id: pendulum", "id: arm"), "unknown option"),
+    "config.yaml that is no YAML": (edit_config("env:", "env: ["), "not a configuration of a run"),
+    "versions.json torn": (other_versions, "cannot be read"),
+}
+
+
+@pytest.mark.parametrize("kind", DAMAGES)
+def test_damaged_runs_are_not_resumed(kind, finished, monkeypatch, capsys, tmp_path):
+    damage, message = DAMAGES[kind]
+    folder = damaged(finished, tmp_path, damage)
+    status, error = run(train.main, [f"resume={folder}", "total_steps=400"], monkeypatch, capsys)
+    assert status == 2
+    assert any(part in error for part in message.split("|")), error
+    assert "Traceback" not in error
+
+
+def tear_last_line(folder):
+    with (folder / "metrics.jsonl").open("a") as file:
+        file.write('{"update": 2, "st')
+
+
+def test_a_stray_line_in_metrics_is_cut_off(finished, monkeypatch, capsys, tmp_path):
+    """A torn last line, as a kill leaves it, is no reason not to resume."""
+    folder = damaged(finished, tmp_path, tear_last_line)
+    status, error = run(train.main, [f"resume={folder}", "total_steps=8"], monkeypatch, capsys)
+    assert (status, error) == (0, "")
+    lines = [json.loads(line) for line in (folder / "metrics.jsonl").read_text().splitlines()]
+    assert [line["update"] for line in lines] == [1, 2]

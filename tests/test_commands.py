@@ -1,0 +1,191 @@
+"""The commands as their users run them: real processes, real folders."""
+
+import json
+import re
+import signal
+import subprocess
+import sys
+import time
+
+import pytest
+
+from jaxpg.run.checkpoint import Checkpoints
+
+TINY = (
+    "num_envs=4",
+    "num_steps=4",
+    "log_interval=64",
+    "eval_interval=256",
+    "eval_episodes=2",
+    "checkpoint_interval=256",
+)
+LINES = 64  # log lines of the run that is stopped and resumed
+LONG = (*TINY, f"total_steps={64 * LINES}", "env.episode_length=20")
+
+
+def metrics(folder):
+    """The lines of metrics, without their times."""
+    lines = [json.loads(line) for line in (folder / "metrics.jsonl").read_text().splitlines()]
+    return [{name: value for name, value in line.items() if name != "seconds"} for line in lines]
+
+
+def digests(folder):
+    """SHA-256 of every array of the newest checkpoint, and its number."""
+    checkpoints = Checkpoints(folder / "checkpoints")
+    return checkpoints.latest(), checkpoints.record(checkpoints.latest())["leaves"]
+
+
+@pytest.fixture(scope="module")
+def uninterrupted(command, tmp_path_factory):
+    folder = tmp_path_factory.mktemp("runs") / "uninterrupted"
+    result = command("train", *LONG, f"run_dir={folder}")
+    assert result.returncode == 0, result.stderr
+    return folder, result
+
+
+def test_a_run_leaves_everything_behind(uninterrupted):
+    folder, result = uninterrupted
+    assert {path.name for path in folder.iterdir()} == {
+        *("config.yaml", "versions.json", "metrics.jsonl", "tb", "checkpoints", "best", "learning_curve.png")
+    }
+    assert (folder / "learning_curve.png").read_bytes().startswith(b"\x89PNG")
+    assert list((folder / "tb").glob("events*"))
+    assert f"python -m jaxpg.evaluate run={folder}" in result.stdout
+    assert len(metrics(folder)) == LINES
+    assert json.loads((folder / "versions.json").read_text())["threads"] >= 1
+
+
+def test_a_run_makes_no_noise(uninterrupted):
+    """Nothing on standard error, and no library's talk on standard output."""
+    _, result = uninterrupted
+    assert result.stderr == ""
+    assert not re.search("warp|warning|absl|deprecat", result.stdout, re.IGNORECASE)
+    assert result.stdout.startswith(
+        "td on pendulum, seed 0: 4 environments x 4 steps x 256 updates = 4,096 steps, into"
+    )
+    assert "compiling" in result.stdout
+
+
+@pytest.mark.parametrize(("stop", "status", "after"), [("SIGTERM", 143, 5), ("SIGINT", 130, 17), ("SIGKILL", -9, 30)])
+def test_stopped_and_resumed_is_never_stopped(
+    uninterrupted, command, command_environment, tmp_path, stop, status, after
+):
+    """State, best policy and metrics to the bit, wherever the run was stopped."""
+    whole, _ = uninterrupted
+    folder = tmp_path / "stopped"
+    with subprocess.Popen(
+        [sys.executable, "-m", "jaxpg.train", *LONG, f"run_dir={folder}"],
+        env=command_environment,
+        stdout=subprocess.DEVNULL,
+    ) as process:
+        log = folder / "metrics.jsonl"
+        deadline = time.monotonic() + 300
+        while not (log.exists() and log.read_text().count("\n") >= after):
+            assert process.poll() is None, "the run ended before it could be stopped"
+            assert time.monotonic() < deadline
+            time.sleep(0.002)
+        process.send_signal(signal.Signals[stop])
+        assert process.wait(timeout=60) == status
+    assert len(metrics(folder)) < LINES
+    result = command("train", f"resume={folder}")
+    assert result.returncode == 0, result.stderr
+    assert "resuming" in result.stdout
+    assert "not the same bits" not in result.stdout
+    assert metrics(folder) == metrics(whole)
+    assert digests(folder) == digests(whole)
+
+
+def test_resume_with_more_steps(command, tmp_path):
+    folder = tmp_path / "run"
+    assert command("train", *TINY, "total_steps=256", f"run_dir={folder}").returncode == 0
+    assert "is finished" in command("train", f"resume={folder}").stdout
+    result = command("train", f"resume={folder}", "total_steps=512")
+    assert result.returncode == 0, result.stderr
+    assert [line["steps"] for line in metrics(folder)] == list(range(64, 513, 64))
+
+
+def test_evaluation_of_a_run(uninterrupted, command):
+    folder, _ = uninterrupted
+    results = [
+        command("evaluate", f"run={folder}", "episodes=8", "json=true", "env.episode_length=200", *more)
+        for more in ((), (), ("seed=1",), ("checkpoint=last",))
+    ]
+    for result in results:
+        assert result.returncode == 0, result.stderr
+        assert result.stderr == ""
+    answers = [json.loads(result.stdout.splitlines()[-1]) for result in results]
+    assert set(answers[0]) == {"mean", "stderr", "episodes", "success"}
+    assert answers[0]["episodes"] == 8
+    assert -2000 < answers[0]["mean"] < 0
+    assert answers[0] == answers[1], "the same seed gives the same starts"
+    assert answers[0] != answers[2]
+
+
+def test_gymnasium_plays_the_same_episodes(command, tmp_path):
+    """Mean returns in Gymnasium and in MJX agree within 4 standard errors of their difference."""
+    folder = tmp_path / "run"
+    assert command("train", *TINY, "total_steps=256", f"run_dir={folder}").returncode == 0
+    arguments = (f"run={folder}", "episodes=200", "json=true")
+    answers = [
+        json.loads(command("evaluate", *arguments, f"backend={backend}").stdout.splitlines()[-1])
+        for backend in ("mjx", "gymnasium")
+    ]
+    spread = (answers[0]["stderr"] ** 2 + answers[1]["stderr"] ** 2) ** 0.5
+    assert abs(answers[0]["mean"] - answers[1]["mean"]) < 4 * spread
+
+
+@pytest.mark.parametrize("algo", ["td", "reinforce"])
+def test_several_seeds_of_the_arm(command, tmp_path, algo):
+    folder = tmp_path / "run"
+    arguments = [argument for argument in TINY if algo == "td" or not argument.startswith("num_steps")]
+    result = command(
+        *("train", "env=arm", f"algo={algo}", "num_seeds=3", *arguments, "env.episode_length=8", "total_steps=256"),
+        f"run_dir={folder}",
+    )
+    assert result.returncode == 0, result.stderr
+    assert "success" in result.stdout
+    line = metrics(folder)[-1]
+    assert len(line["eval_return"]) == len(line["eval_success"]) == 3
+    assert len(set(line["eval_return"])) == 3, "different seeds are different agents"
+    answer = json.loads(
+        command("evaluate", f"run={folder}", "episodes=2", "json=true", "agent=2").stdout.splitlines()[-1]
+    )
+    assert answer["success"] is not None
+
+
+def test_brax_environments_train(command, tmp_path):
+    folder = tmp_path / "run"
+    result = command(
+        *("train", "env=brax", "env.name=inverted_pendulum", "env.episode_length=8", *TINY, "total_steps=256"),
+        f"run_dir={folder}",
+        timeout=900,
+    )
+    assert result.returncode == 0, result.stderr
+    assert result.stderr == ""
+    assert len(metrics(folder)) == 4
+
+
+def test_help_lists_every_option(command):
+    result = command("train", "--help", "env=arm", "algo=reinforce")
+    assert result.returncode == 0
+    for text in (
+        "env.success_radius=0.05",
+        "algo.baseline=value",
+        "network.widths=[64,64]",
+        "total_steps=",
+        "none or mean or value",
+    ):
+        assert text in result.stdout
+    assert "run=" in command("evaluate", "--help").stdout
+
+
+def test_several_mistakes_are_reported_at_once_with_status_2(command, tmp_path):
+    result = command("train", "algo.gamma=2", "seed=-1", "num_envs=2.5", f"run_dir={tmp_path / 'run'}")
+    assert result.returncode == 2
+    assert result.stdout == ""
+    assert [line.split(":")[1].strip() for line in result.stderr.splitlines()] == [
+        "algo.gamma=2",
+        "seed=-1",
+        "num_envs=2.5",
+    ]
+    assert not (tmp_path / "run").exists()

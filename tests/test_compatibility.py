@@ -1,0 +1,47 @@
+"""Releases of jaxlib that compute wrong numbers are refused."""
+
+import jax
+import jax.numpy as jnp
+import jaxlib
+import pytest
+
+from jaxpg.compatibility import WRONG_SUMS, check_jaxlib
+from jaxpg.run.config import compose
+from jaxpg.run.program import agent_keys, make_algorithm, make_env
+from jaxpg.training import train_scan
+
+
+@pytest.mark.parametrize("version", WRONG_SUMS)
+def test_releases_with_wrong_sums_are_refused_by_name(version):
+    with pytest.raises(ImportError, match=version):
+        check_jaxlib(version)
+
+
+def wrong_sums(calls=40):
+    """In how many of the calls a sum of 2 * 1024 * 1024 ones is not that."""
+    total = jax.jit(lambda a: jnp.sum(jnp.broadcast_to(a, (2, 1024, 1024))))
+    ones = jnp.ones((1024, 1024))
+    return sum(float(total(ones)) != 2 * 1024 * 1024 for _ in range(calls))
+
+
+def test_the_installed_release_sums_right_or_is_refused():
+    """Where a release of `WRONG_SUMS` is installed, `python tests/test_compatibility.py` reproduces the wrong sums."""
+    check_jaxlib(jaxlib.__version__)
+    assert wrong_sums() == 0
+
+
+@pytest.mark.parametrize("environment", ["pendulum", "arm"])
+def test_the_training_program_makes_no_lapack_call(environment):
+    """Neither the start nor the updates of two agents at once: batched LAPACK calls hang on some releases."""
+    sizes = ("num_seeds=2", "num_envs=8", "num_steps=2", "total_steps=32", "eval_episodes=2")
+    config = compose([f"env={environment}", *sizes])
+    env = make_env(config)
+    algorithm = make_algorithm(config, env)
+    train = jax.jit(jax.vmap(lambda key: train_scan(algorithm, key, 2)))
+    with jax.debug_key_reuse(False):  # see test_vmapped_seeds_are_single_seeds
+        compiled = train.lower(agent_keys(config)).compile().as_text()
+    assert 'custom_call_target="lapack' not in compiled
+
+
+if __name__ == "__main__":
+    print(f"jaxlib {jaxlib.__version__}: {wrong_sums()} of 40 sums are wrong")

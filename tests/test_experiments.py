@@ -1,0 +1,57 @@
+"""The experiments run from beginning to end, here with tiny sizes; their figures come from the full ones."""
+
+import json
+import sys
+from pathlib import Path
+
+import pytest
+
+EXPERIMENTS = Path(__file__).parent.parent / "experiments"
+
+
+@pytest.fixture
+def experiments(monkeypatch, command_environment, tmp_path):
+    """The scripts' common part, told to train for a moment only and to write elsewhere."""
+    monkeypatch.syspath_prepend(str(EXPERIMENTS))
+    for name, value in command_environment.items():
+        monkeypatch.setenv(name, value)
+    import commands
+
+    full = commands.train
+
+    def tiny(folder, *arguments):
+        kept = [argument for argument in arguments if not argument.startswith("total_steps")]
+        sizes = ["num_envs=2", "eval_episodes=4", "env.episode_length=10", "log_interval=20", "eval_interval=20"]
+        return full(folder, *kept, *sizes, "total_steps=40")
+
+    monkeypatch.setattr(commands, "train", tiny)
+    monkeypatch.setattr(commands, "RESULTS", tmp_path)
+    yield tmp_path
+    for name in ("commands", "default_runs", "reinforce_and_td"):
+        sys.modules.pop(name, None)
+
+
+def test_default_runs(experiments, monkeypatch):
+    import default_runs
+
+    monkeypatch.setattr(default_runs, "PENDULUM_SEEDS", range(1))
+    monkeypatch.setattr(default_runs, "ARM_RUNS", default_runs.ARM_RUNS[-1:])
+    monkeypatch.setattr(
+        default_runs, "evaluate", lambda folder, *options: {"mean": -1.0, "stderr": 0.1, "success": 0.5}
+    )
+    default_runs.main([])
+    rows = json.loads((experiments / "default_runs_arm.json").read_text())
+    assert rows[0]["within_2cm"] == 0.5
+    assert len(json.loads((experiments / "default_runs_pendulum.json").read_text())) == 2
+
+
+def test_reinforce_and_td(experiments, monkeypatch):
+    import reinforce_and_td
+
+    monkeypatch.setattr(reinforce_and_td, "NUM_SEEDS", 2)
+    monkeypatch.setattr(reinforce_and_td, "RESULTS", experiments)
+    reinforce_and_td.main()
+    summary = json.loads((experiments / "reinforce_and_td.json").read_text())
+    assert set(summary) == {"pendulum td", "pendulum reinforce", "arm td", "arm reinforce"}
+    assert all(curve["steps"] for curve in summary.values())
+    assert (experiments / "reinforce_and_td.png").read_bytes().startswith(b"\x89PNG")

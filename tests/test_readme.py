@@ -1,0 +1,50 @@
+"""What the README says can be done, done; its two set-up commands are run by `.ci/run`."""
+
+import re
+import shlex
+from pathlib import Path
+
+ROOT = Path(__file__).parent.parent
+README = (ROOT / "README.md").read_text(encoding="utf-8")
+
+
+def blocks(language):
+    return re.findall(rf"```{language}\n(.*?)```", README, re.DOTALL)
+
+
+def test_python_examples_run():
+    assert len(blocks("python")) == 2
+    for code in blocks("python"):
+        exec(compile(code, "README.md", "exec"), {})
+
+
+def test_commands_run(command, tmp_path):
+    """Each with a few steps only; run folders below a temporary folder."""
+    lines = [
+        line for block in blocks("bash") for line in block.splitlines() if line.startswith(".venv/bin/python -m jaxpg")
+    ]
+    assert len(lines) == 5
+    tiny = ["num_envs=2", "num_steps=2", "total_steps=4", "eval_episodes=2"]
+    for line in lines:
+        _, _, module, *arguments = shlex.split(line)
+        arguments = [re.sub(r"=runs/", f"={tmp_path}/", argument) for argument in arguments]
+        if "resume=" in line:
+            arguments = [re.sub(r"total_steps=.*", "total_steps=8", argument) for argument in arguments]
+        elif "train" in module:
+            arguments += tiny
+        result = command(module.removeprefix("jaxpg."), *arguments)
+        assert result.returncode == 0, (line, result.stderr)
+
+
+def test_ci_runs_the_set_up_commands():
+    setup = [line for block in blocks("bash") for line in block.splitlines() if line.startswith("python3 -m venv")]
+    assert len(setup) == 2
+    assert setup[0].endswith("-m jaxpg.train env=pendulum")
+    assert setup[1].endswith("-m pytest")
+    script = (ROOT / ".ci" / "run").read_text()
+    assert "README.md" in script
+
+
+def test_named_files_exist():
+    for path in re.findall(r"(?:experiments|docs)/[\w/]+\.\w+", README):
+        assert (ROOT / path).exists(), path
