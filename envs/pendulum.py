@@ -39,13 +39,13 @@ TRAINING = {
     "td": {
         "num_envs": 64,
         "num_steps": 16,
-        "total_steps": 5_000_000,
-        "algo.gamma": 0.985,
-        "algo.lambda_": 0.8,
+        "total_steps": 4_000_000,
+        "algo.gamma": 0.97,
+        "algo.lambda_": 0.9,
         "algo.actor_lr": 0.003,
         "algo.critic_lr": 0.006,
         "algo.final_lr": 0.02,
-        "algo.reward_scale": 0.1,
+        "algo.reward_scale": 0.02,
         "network.sigma": 1.0,
     },
     "reinforce": {

@@ -4,15 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+from jaxpg.run import config, help
 from jaxpg.run.errors import run_command
 
 
 def main(arguments: Sequence[str]) -> int:
     """The training command; returns its exit status."""
-    from jaxpg.run import config
-
     if {"--help", "-h"} & set(arguments):
-        print(config.help_text([argument for argument in arguments if not argument.startswith("-")]))
+        print(help.train_help([argument for argument in arguments if not argument.startswith("-")]))
         return 0
     from jaxpg.run import session
 

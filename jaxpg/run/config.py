@@ -15,72 +15,10 @@ from pathlib import Path
 from typing import Any
 
 import envs
-from envs.options import OptionError, build, describe, option, unknown
-from jaxpg.actor_critic import BASELINES
-from jaxpg.networks import ACTIVATIONS
+from envs.options import OptionError, build, unknown
 from jaxpg.run.errors import UserError
+from jaxpg.run.schema import GROUPS, Run
 
-
-@dataclass(frozen=True)
-class Learning:
-    """Options that TD and REINFORCE share."""
-
-    gamma: float = option(0.99, "discount", at_least=0, at_most=1)
-    actor_lr: float = option(0.002, "Adam step size of the actor", above=0)
-    critic_lr: float = option(0.004, "Adam step size of the critic", above=0)
-    final_lr: float = option(0.1, "step sizes fall linearly to this fraction", at_least=0, at_most=1)
-    max_gradient_norm: float = option(1.0, "longer gradients are shortened to this", above=0)
-    reward_scale: float = option(1.0, "factor on the rewards that are learned from", above=0)
-    entropy_coef: float = option(0.0, "weight of the entropy bonus", at_least=0)
-    normalize_advantages: bool = option(True, "advantages with mean 0 and deviation 1 over the batch")
-    normalize_observations: bool = option(True, "observations with running mean 0 and deviation 1")
-
-
-@dataclass(frozen=True)
-class TD(Learning):
-    """Temporal differences: TD(lambda) actor-critic; lambda_=0 is the one-step TD error."""
-
-    lambda_: float = option(0.95, "weight of longer returns: 0 is TD(0), 1 Monte Carlo", at_least=0, at_most=1)
-
-
-@dataclass(frozen=True)
-class Reinforce(Learning):
-    """REINFORCE: complete episodes, Monte Carlo returns."""
-
-    baseline: str = option("value", "what is subtracted from the return", choices=BASELINES)
-
-
-@dataclass(frozen=True)
-class MLP:
-    """Separate multilayer perceptrons for actor and critic."""
-
-    widths: list[int] = option([64, 64], "hidden units by layer", at_least=1)
-    activation: str = option("tanh", "activation of the hidden layers", choices=tuple(ACTIVATIONS))
-    sigma: float = option(0.5, "initial standard deviation of the policy, before tanh", above=0)
-    learn_sigma: bool = option(True, "learn the standard deviation")
-
-
-@dataclass(frozen=True)
-class Run:
-    """Options of the run itself."""
-
-    seed: int = option(0, "random seed", at_least=0, at_most=2**32 - 1)
-    num_seeds: int = option(1, "agents trained at once, with seeds seed, seed + 1, ...", at_least=1)
-    num_envs: int = option(64, "environments of each agent", at_least=1)
-    num_steps: int | None = option(None, "steps of a rollout (td); reinforce plays whole episodes", at_least=1)
-    total_steps: int = option(1_000_000, "environment steps to train for, of each agent", at_least=1)
-    log_interval: int = option(50_000, "environment steps between two lines of metrics", at_least=1)
-    eval_interval: int = option(250_000, "environment steps between two evaluations", at_least=1)
-    eval_episodes: int = option(512, "episodes of an evaluation", at_least=1)
-    checkpoint_interval: int = option(1_000_000, "environment steps between two checkpoints", at_least=1)
-    run_dir: str | None = option(None, "run folder [default: runs/<env>-<algo>-s<seed>-<time>]")
-
-
-GROUPS: dict[str, dict[str, type]] = {
-    "env": {name: entry.config for name, entry in envs.REGISTRY.items()},
-    "algo": {"td": TD, "reinforce": Reinforce},
-    "network": {"mlp": MLP},
-}
 DEFAULT_CHOICES = {"env": "pendulum", "algo": "td", "network": "mlp"}
 DEFAULT_ROLLOUT = 16  # steps of a TD rollout where neither the user nor the environment says
 
@@ -287,37 +225,3 @@ def flatten(config: Config) -> dict[str, Any]:
         for name in option_fields(config.choices)
         for group, _, leaf in [name.rpartition(".")]
     }
-
-
-def help_text(arguments: Sequence[str]) -> str:
-    """Every option with its default for the chosen environment and algorithm, its range and its meaning."""
-    config = compose(arguments)
-    values = flatten(config)
-    lines = [
-        "usage: python -m jaxpg.train [group=member] [option=value] ...",
-        "       python -m jaxpg.train resume=DIR [total_steps=N]",
-        "",
-    ]
-    for group, members in GROUPS.items():
-        lines.append(f"{group}={config.choices[group]}".ljust(28) + f"one of {', '.join(members)}")
-    section = None
-    for name, field in sorted(option_fields(config.choices).items(), key=lambda item: item[0].rpartition(".")[0]):
-        group = name.rpartition(".")[0]
-        if group != section:
-            section = group
-            title = GROUPS[group][config.choices[group]].__doc__ if group else Run.__doc__
-            lines += ["", title.splitlines()[0]]
-        lines.append(f"  {name}={_shown(values[name])}".ljust(38) + describe(field))
-    lines += [
-        "",
-        "Shown are the defaults for the environment and the algorithm named above; add env=... or algo=... for others.",
-    ]
-    return "\n".join(lines)
-
-
-def _shown(value: Any) -> str:
-    if value is None:
-        return ""
-    if isinstance(value, bool):
-        return str(value).lower()
-    return str(value).replace(" ", "")

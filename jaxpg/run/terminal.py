@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-import sys
 import time
 from typing import Any
 
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeRemainingColumn
-from rich.table import Table
 
 
 class Display:
@@ -46,7 +44,6 @@ class Display:
                 f"{line['steps'] / self._total:4.0%}  {line['steps']:>12,} steps  {text}  "
                 f"deterministic {shown(line['eval_return'])}  {left:.0f} s left"
             )
-            sys.stdout.flush()
 
     def stop(self) -> None:
         if self._bar:
@@ -54,10 +51,9 @@ class Display:
 
     def table(self, rows: dict[str, str]) -> None:
         """The short table at the end."""
-        table = Table(show_header=False, box=None, pad_edge=False)
+        width = max(map(len, rows)) + 2
         for name, value in rows.items():
-            table.add_row(name, value, style=None)
-        self.console.print(table)
+            self.say(f"{name:<{width}}{value}")
 
 
 def shown(value: Any) -> str:

@@ -1,0 +1,42 @@
+"""The help of the commands, made from the options themselves."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+from typing import Any
+
+from envs.options import describe
+from jaxpg.run.config import compose, flatten, option_fields
+from jaxpg.run.schema import GROUPS, EvaluateOptions, Run
+
+
+def train_help(arguments: Sequence[str]) -> str:
+    """Every option with its default for the chosen environment and algorithm, its range and its meaning."""
+    config = compose(arguments)
+    values, fields = flatten(config), option_fields(config.choices)
+    lines = [
+        "usage: python -m jaxpg.train [group=member] [option=value] ...",
+        "       python -m jaxpg.train resume=DIR [total_steps=N]",
+        "",
+        *(f"{group}={config.choices[group]}".ljust(28) + f"one of {', '.join(GROUPS[group])}" for group in GROUPS),
+    ]
+    for group in ("", *GROUPS):
+        schema = GROUPS[group][config.choices[group]] if group else Run
+        names = [name for name in fields if name.rpartition(".")[0] == group]
+        lines += ["", schema.__doc__.splitlines()[0], *(_line(name, values[name], fields[name]) for name in names)]
+    lines += ["", "Shown are the defaults for the environment and the algorithm named above; add env=... or algo=..."]
+    return "\n".join(lines)
+
+
+def evaluate_help() -> str:
+    """Every option of the evaluation."""
+    lines = ["usage: python -m jaxpg.evaluate run=DIR [option=value] ...", "", EvaluateOptions.__doc__]
+    return "\n".join(lines + [_line(field.name, field.default, field) for field in dataclasses.fields(EvaluateOptions)])
+
+
+def _line(name: str, value: Any, field: dataclasses.Field) -> str:
+    shown = "" if value is None else str(value).replace(" ", "")
+    if isinstance(value, bool):
+        shown = shown.lower()
+    return f"  {name}={shown}".ljust(38) + describe(field)
