@@ -37,14 +37,12 @@ class PendulumConfig:
 
 TRAINING = {
     "td": {
-        "num_envs": 64,
+        "num_envs": 32,
         "num_steps": 16,
         "total_steps": 4_000_000,
         "algo.gamma": 0.97,
         "algo.lambda_": 0.9,
-        "algo.actor_lr": 0.003,
-        "algo.critic_lr": 0.006,
-        "algo.final_lr": 0.02,
+        "algo.final_lr": 0.05,
         "algo.reward_scale": 0.02,
         "network.sigma": 1.0,
     },
