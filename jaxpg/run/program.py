@@ -30,19 +30,15 @@ class Schedule(NamedTuple):
     Attributes:
       steps_per_update: environment steps of one update (of each agent).
       chunk: updates between two lines of metrics.
-      num_chunks: chunks of the whole run; `total_steps` rounded up to whole ones.
+      num_updates: updates of the whole run.
       eval_every, checkpoint_every: in chunks.
     """
 
     steps_per_update: int
     chunk: int
-    num_chunks: int
+    num_updates: int
     eval_every: int
     checkpoint_every: int
-
-    @property
-    def num_updates(self) -> int:
-        return self.chunk * self.num_chunks
 
     @property
     def total_steps(self) -> int:
@@ -69,19 +65,23 @@ class Program(NamedTuple):
     state_shape: RunState
 
 
-def plan(config: Config) -> Schedule:
-    """The updates of a run: intervals in environment steps rounded up to whole updates and chunks."""
+def plan(config: Config, done: int = 0) -> Schedule:
+    """The updates of a run: intervals in environment steps rounded up to whole updates and chunks.
+
+    Args:
+      config: of the run.
+      done: updates made already; what is left is rounded up to whole chunks.
+    """
     run = config.run
     steps_per_update = run.num_envs * run.num_steps
-    num_updates = _ceil(run.total_steps, steps_per_update)
-    chunk = min(_ceil(run.log_interval, steps_per_update), num_updates)
-    chunk_steps = chunk * steps_per_update
+    left = max(_ceil(run.total_steps, steps_per_update) - done, 0)
+    chunk = min(_ceil(run.log_interval, steps_per_update), max(left, 1))
     return Schedule(
         steps_per_update=steps_per_update,
         chunk=chunk,
-        num_chunks=_ceil(num_updates, chunk),
-        eval_every=_ceil(run.eval_interval, chunk_steps),
-        checkpoint_every=_ceil(run.checkpoint_interval, chunk_steps),
+        num_updates=done + _ceil(left, chunk) * chunk,
+        eval_every=_ceil(run.eval_interval, chunk * steps_per_update),
+        checkpoint_every=_ceil(run.checkpoint_interval, chunk * steps_per_update),
     )
 
 
@@ -117,10 +117,11 @@ def make_algorithm(config: Config, env: Any) -> Algorithm:
 
 def make_optimizer(config: Config) -> optax.GradientTransformation:
     """Adam for actor and critic apart, with shortened gradients and linearly falling step sizes."""
-    algo, num_updates = config.algo, plan(config).num_updates
+    algo, run = config.algo, config.run
+    horizon = _ceil(run.total_steps, run.num_envs * run.num_steps)
 
     def adam(step_size):
-        schedule = optax.linear_schedule(step_size, step_size * algo.final_lr, num_updates)
+        schedule = optax.linear_schedule(step_size, step_size * algo.final_lr, horizon)
         return optax.chain(optax.clip_by_global_norm(algo.max_gradient_norm), optax.adam(schedule, eps=1e-5))
 
     return optax.multi_transform(
@@ -128,14 +129,14 @@ def make_optimizer(config: Config) -> optax.GradientTransformation:
     )
 
 
-def compile_program(config: Config, env: Any) -> Program:
-    """Traces and compiles the training chunk and the evaluation in `env`; the two compile side by side."""
-    run, schedule = config.run, plan(config)
+def compile_program(config: Config, env: Any, chunk: int) -> Program:
+    """Traces and compiles `chunk` updates and the evaluation, in `env`."""
+    run = config.run
     networks, algorithm = make_networks(config, env), make_algorithm(config, env)
     keys = agent_keys(config)
 
     def advance(key, train):
-        return train_scan(algorithm, key, schedule.chunk, train)
+        return train_scan(algorithm, key, chunk, train)
 
     def play(policy):
         act = deterministic_policy(networks, policy.params, policy.normalizer)

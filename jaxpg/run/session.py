@@ -14,7 +14,7 @@ from jaxpg.run.checkpoint import Checkpoints
 from jaxpg.run.config import Config
 from jaxpg.run.errors import UserError
 from jaxpg.run.folder import MetricsLog, RunFolder, jsonable
-from jaxpg.run.program import Program, compile_program, make_env, plan
+from jaxpg.run.program import Program, Schedule, compile_program, make_env, plan
 from jaxpg.run.runtime import StopRequests, prepare
 from jaxpg.run.state import Best, RunState, better, current_policy
 from jaxpg.run.terminal import Display, shown
@@ -37,8 +37,8 @@ def begin(config: Config) -> int:
         f"{algo} on {config.choices['env']}, {agents}: {run.num_envs} environments x {run.num_steps} steps x "
         f"{schedule.num_updates:,} updates = {schedule.total_steps:,} steps, into {run_folder.path}"
     )
-    program, seconds = _compile(display, config, env)
-    return _train(config, run_folder, display, program, program.init(), seconds)
+    program, seconds = _compile(display, config, env, schedule)
+    return _train(config, schedule, run_folder, display, program, program.init(), seconds)
 
 
 def resume(given: Mapping[str, Any]) -> int:
@@ -52,7 +52,7 @@ def resume(given: Mapping[str, Any]) -> int:
         raise UserError(f"{run_folder.path} has no checkpoint yet: start again with another run_dir")
     recorded = folder.read_versions(run_folder)
     prepare(config, recorded.get("threads"))
-    schedule = plan(config)
+    schedule = plan(config, done=update)
     display = Display(schedule.total_steps, steps=update * schedule.steps_per_update)
     if update >= schedule.num_updates:
         _draw(config, run_folder)
@@ -64,10 +64,10 @@ def resume(given: Mapping[str, Any]) -> int:
     for name, now in folder.versions().items():
         if recorded.get(name) != now:
             display.say(f"note: {name} was {recorded.get(name)} and is {now}: the same run, but not the same bits")
-    program, seconds = _compile(display, config, make_env(config))
+    program, seconds = _compile(display, config, make_env(config), schedule)
     state = checkpoints.restore(update, program.state_shape)
     configuration.save(config, run_folder.config)
-    return _train(config, run_folder, display, program, state, seconds)
+    return _train(config, schedule, run_folder, display, program, state, seconds)
 
 
 def _changed(run_folder: RunFolder, changes: Mapping[str, Any]) -> Config:
@@ -84,20 +84,25 @@ def _changed(run_folder: RunFolder, changes: Mapping[str, Any]) -> Config:
     return changed
 
 
-def _compile(display: Display, config: Config, env: Any) -> tuple[Program, float]:
+def _compile(display: Display, config: Config, env: Any, schedule: Schedule) -> tuple[Program, float]:
     display.say("compiling ...")
     began = time.monotonic()
-    program = compile_program(config, env)
+    program = compile_program(config, env, schedule.chunk)
     seconds = time.monotonic() - began
     display.say(f"compiled in {seconds:.1f} s")
     return program, seconds
 
 
 def _train(
-    config: Config, run_folder: RunFolder, display: Display, program: Program, state: RunState, compile_seconds: float
+    config: Config,
+    schedule: Schedule,
+    run_folder: RunFolder,
+    display: Display,
+    program: Program,
+    state: RunState,
+    compile_seconds: float,
 ) -> int:
     """Chunk after chunk until the last update or a request to stop; returns the exit status."""
-    schedule = plan(config)
     keeper = _Keeper(run_folder, config)
     first = update = int(state.train.update[0])
     log = MetricsLog(run_folder, update)
