@@ -89,6 +89,7 @@ def tree(folder):
 
 RUN_MISTAKES = {
     "folder in use": (train, ["run_dir={run}"], "is not empty: take another run_dir, or resume="),
+    "folder named like a pattern": (train, ["run_dir={run}/[x]"], "a folder with [ or ] in its name"),
     "folder below a file": (train, ["run_dir={run}/config.yaml/x"], "cannot write a run folder there"),
     "another environment": (train, ["resume={run}", "env=arm"], "env=arm: the run has env=pendulum"),
     "another network": (

@@ -96,7 +96,7 @@ def test_stopped_and_resumed_is_never_stopped(
 
 
 def test_resume_with_more_steps(command, tmp_path):
-    folder = tmp_path / "run"
+    folder = tmp_path / "a run, (with) odd name=x äß"
     assert command("train", *TINY, "total_steps=256", f"run_dir={folder}").returncode == 0
     assert "is finished" in command("train", f"resume={folder}").stdout
     result = command("train", f"resume={folder}", "total_steps=512")

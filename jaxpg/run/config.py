@@ -20,6 +20,7 @@ from jaxpg.run.errors import UserError
 from jaxpg.run.schema import GROUPS, Run
 
 DEFAULT_CHOICES = {"env": "pendulum", "algo": "td", "network": "mlp"}
+FOLDERS = ("run_dir", "resume", "run")  # options whose value is a path
 DEFAULT_ROLLOUT = 16  # steps of a TD rollout where neither the user nor the environment says
 
 
@@ -109,17 +110,25 @@ def parse(arguments: Sequence[str]) -> dict[str, Any]:
 
     parser, given = OverridesParser.create(), {}
     for argument in arguments:
-        try:
-            override = parser.parse_override(argument)
-        except HydraException:
-            raise UserError(f"'{argument}': expected name=value, such as seed=3; see --help") from None
-        name = override.key_or_group
-        if not (override.type.name == "CHANGE" and override.package is None and not override.is_sweep_override()):
-            raise UserError(f"'{argument}': expected name=value, such as seed=3; see --help")
+        name, _, text = argument.partition("=")
+        if name in FOLDERS and text:
+            value = text  # as it stands: Hydra's grammar has no brackets, commas or spaces in plain words
+        else:
+            try:
+                override = parser.parse_override(argument)
+            except HydraException:
+                raise _not_an_override(argument) from None
+            if override.type.name != "CHANGE" or override.package or override.is_sweep_override():
+                raise _not_an_override(argument)
+            name, value = override.key_or_group, _plain(override.value())
         if name in given:
             raise UserError(f"{name} is given twice")
-        given[name] = _plain(override.value())
+        given[name] = value
     return given
+
+
+def _not_an_override(argument: str) -> UserError:
+    return UserError(f"'{argument}': expected name=value, such as seed=3; see --help")
 
 
 def _plain(value: Any) -> Any:

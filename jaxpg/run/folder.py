@@ -45,7 +45,7 @@ def create(config: Config) -> RunFolder:
     """A new run folder: the one asked for, or `runs/<env>-<algo>-s<seed>-<time>`.
 
     Raises:
-      UserError: the folder is in use or cannot be made.
+      UserError: the folder is in use, cannot be made, or has a name that orbax takes for a pattern.
     """
     run = config.run
     if run.run_dir is not None:
@@ -54,6 +54,8 @@ def create(config: Config) -> RunFolder:
         name = config.env.name if config.choices["env"] == "brax" else config.choices["env"]
         stamp = time.strftime("%Y%m%d-%H%M%S")
         folder = RunFolder(Path("runs") / f"{name}-{config.choices['algo']}-s{run.seed}-{stamp}")
+    if set("[]") & set(str(folder.path.resolve())):
+        raise UserError(f"{folder.path}: checkpoints cannot be kept below a folder with [ or ] in its name")
     try:
         if folder.path.exists() and any(folder.path.iterdir()):
             raise UserError(f"{folder.path} is not empty: take another run_dir, or resume={folder.path}")
