@@ -1,0 +1,248 @@
+"""A function of small arrays turned into the same function as scalar equations.
+
+`scalarize(fn, *example_args)` traces `fn` to a jaxpr and interprets it once, with every array replaced by its elements: a number
+where the element is known, an `Expression` where it depends on the arguments. Slicing, gathering, padding and stacking then
+cost nothing, products with 0 vanish, small dot products, factorisations and fixed-length loops are written out, and
+what is used by nobody is dropped. What is left is handed to XLA as scalar operations, which under `vmap` are
+operations on contiguous vectors of the batch.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from envs.physics.expressions import Expression, Graph
+from envs.physics.rules import RULES, UnsupportedPrimitive, as_objects, is_numeric, map_scalar, pack
+from envs.physics.stages import in_order, make_stages, run, separately
+
+
+def scalarize(fn: Callable, *example_args: Any) -> Callable:
+    """The same function, as scalar equations.
+
+    Args:
+      fn: a pure function of pytrees of arrays that jax can trace.
+      example_args: arguments (arrays or `jax.ShapeDtypeStruct`s) with the shapes and dtypes that the function will get.
+
+    Returns:
+      A function of the same arguments with the same result, up to rounding, that can be jitted, batched and
+      differentiated. Its attribute `program` is the `Program`.
+
+    Raises:
+      UnsupportedPrimitive: `fn` uses something that has no scalar form (a loop whose length depends on the data, an
+        index that does); the message names the primitive.
+    """
+    program = trace(fn, *example_args)
+
+    def scalarized(*args):
+        leaves, structure = jax.tree.flatten(args)
+        if structure != program.input_structure:
+            raise TypeError(f"expected arguments {program.input_structure}, got {structure}")
+        elements = program.run(program.split(leaves))
+        return jax.tree.unflatten(program.output_structure, program.join(elements))
+
+    scalarized.program = program
+    return scalarized
+
+
+class Program:
+    """Scalar equations with named ends: what `trace` makes of a function.
+
+    The three steps of a call are apart, so that a loop over the program can carry the elements and leave the arrays outside.
+
+    Attributes:
+      inputs: one array of input expressions for each leaf of the arguments.
+      outputs: one array of expressions and constants for each leaf of the result.
+      input_structure, output_structure: the pytrees of both.
+    """
+
+    def __init__(self, inputs, outputs, output_dtypes, input_structure, output_structure):
+        self.inputs, self.outputs, self.output_dtypes = inputs, outputs, output_dtypes
+        self.input_structure, self.output_structure = input_structure, output_structure
+        self._results = [x for array in outputs for x in as_objects(array).flat]
+        self.stages = make_stages(x for x in self._results if isinstance(x, Expression))
+        self._split = separately(_elements)
+
+    def __len__(self):
+        """The number of scalar equations."""
+        return len(in_order(x for x in self._results if isinstance(x, Expression)))
+
+    def split(self, leaves: list) -> list[jax.Array]:
+        """The elements of the arguments' leaves, in order."""
+        return self._split(*leaves)
+
+    def run(self, elements: list[jax.Array]) -> list[jax.Array]:
+        """The elements of the result's leaves."""
+        values = dict(zip((x.index for array in self.inputs for x in array.flat), elements, strict=True))
+        run(self.stages, values)
+        dtypes = (dtype for array, dtype in zip(self.outputs, self.output_dtypes, strict=True) for _ in array.flat)
+        return [
+            values[x.index] if isinstance(x, Expression) else jnp.asarray(x, dtype)
+            for x, dtype in zip(self._results, dtypes, strict=True)
+        ]
+
+    def join(self, elements: list[jax.Array]) -> list[jax.Array]:
+        """The result's leaves from their elements."""
+        leaves, begin = [], 0
+        for array, dtype in zip(self.outputs, self.output_dtypes, strict=True):
+            mine = elements[begin : begin + array.size]
+            begin += array.size
+            leaves.append(jnp.stack(mine).reshape(array.shape) if mine else jnp.zeros(array.shape, dtype))
+        return leaves
+
+
+def _elements(*leaves):
+    return [leaf[place] for leaf in leaves for place in np.ndindex(*leaf.shape)]
+
+
+def trace(fn: Callable, *example_args: Any) -> Program:
+    """The scalar equations of a function."""
+    closed, shape = jax.make_jaxpr(fn, return_shape=True)(*example_args)
+    graph = Graph()
+    inputs = [_input_array(graph, aval) for aval in closed.in_avals]
+    outputs = evaluate(closed.jaxpr, closed.consts, inputs)
+    return Program(
+        inputs,
+        outputs,
+        [np.dtype(aval.dtype) for aval in closed.out_avals],
+        jax.tree.structure(example_args),
+        jax.tree.structure(shape),
+    )
+
+
+def _input_array(graph: Graph, aval) -> np.ndarray:
+    return pack([graph.input(aval.dtype) for _ in range(int(np.prod(aval.shape, dtype=int)))], aval.shape)
+
+
+def evaluate(jaxpr, consts, args, wanted: list[bool] | None = None) -> list:
+    """The jaxpr's results, with `None` for those that are not wanted; only what they need is interpreted."""
+    outvars = [var for i, var in enumerate(jaxpr.outvars) if wanted is None or wanted[i]]
+    values = dict(zip(jaxpr.constvars, map(np.asarray, consts), strict=True))
+    values.update(zip(jaxpr.invars, args, strict=True))
+    for equation, wanted_here in _needed(jaxpr, outvars):
+        operands = [_read(values, var) for var in equation.invars]
+        results = interpret(equation, operands, wanted_here)
+        values.update(
+            (var, value) for var, value in zip(equation.outvars, results, strict=True) if value is not None
+        )
+    return [_read(values, var) if wanted is None or wanted[i] else None for i, var in enumerate(jaxpr.outvars)]
+
+
+def _needed(jaxpr, outvars) -> list:
+    """The equations that the variables depend on, each with which of its results are used."""
+    used = {var for var in outvars if not _is_literal(var)}
+    kept = []
+    for equation in reversed(jaxpr.eqns):
+        wanted = [var in used for var in equation.outvars]
+        if any(wanted):
+            kept.append((equation, wanted))
+            used.update(var for var in equation.invars if not _is_literal(var))
+    return kept[::-1]
+
+
+def _is_literal(var) -> bool:
+    return hasattr(var, "val")
+
+
+def _read(values, var):
+    return np.asarray(var.val, var.aval.dtype) if _is_literal(var) else values[var]
+
+
+def interpret(equation, operands: list, wanted: list[bool]) -> list:
+    """The results of one equation."""
+    name, params = equation.primitive.name, equation.params
+    if name in CONTROL:
+        return CONTROL[name](operands, wanted, **params)
+    if name not in RULES:
+        raise UnsupportedPrimitive(f"{name}: no scalar rule")
+    results = RULES[name](equation.outvars[0].aval, *operands, **params)
+    results = results if isinstance(results, tuple) else (results,)
+    return [_settle(result, var.aval.dtype) for result, var in zip(results, equation.outvars, strict=True)]
+
+
+def _settle(array: np.ndarray, dtype) -> np.ndarray:
+    """A numeric array where nothing in it depends on the data any more."""
+    if array.dtype == object and not any(isinstance(x, Expression) for x in array.flat):
+        return array.astype(dtype)
+    return array
+
+
+# --- primitives that hold programs ------------------------------------------------------------------------------------
+
+
+def _call(operands, wanted, *, jaxpr=None, call_jaxpr=None, **_):
+    closed = jaxpr if jaxpr is not None else call_jaxpr
+    inner = getattr(closed, "jaxpr", closed)
+    return evaluate(inner, getattr(closed, "consts", ()), operands, wanted)
+
+
+def _scan(operands, wanted, *, jaxpr, length, reverse, num_consts, num_carry, **_):
+    consts, carry = operands[:num_consts], operands[num_consts : num_consts + num_carry]
+    xs = operands[num_consts + num_carry :]
+    rows = []
+    for i in reversed(range(length)) if reverse else range(length):
+        results = evaluate(jaxpr.jaxpr, jaxpr.consts, [*consts, *carry, *(x[i, ...] for x in xs)])
+        carry = results[:num_carry]
+        rows.append(results[num_carry:])
+    rows = rows[::-1] if reverse else rows
+    stacked = [
+        np.stack(column if is_numeric(*column) else list(map(as_objects, column)))
+        for column in zip(*rows, strict=True)
+    ] or [np.zeros((0, *var.aval.shape), var.aval.dtype) for var in jaxpr.jaxpr.outvars[num_carry:]]
+    return [*carry, *stacked]
+
+
+def _cond(operands, wanted, *, branches, **_):
+    """The branch that is taken; if that depends on the data, both, and a select: what `vmap` makes of it as well."""
+    which, *operands = operands
+    if is_numeric(which):
+        branch = branches[int(np.clip(int(which), 0, len(branches) - 1))]
+        return evaluate(branch.jaxpr, branch.consts, operands, wanted)
+    results = [evaluate(branch.jaxpr, branch.consts, operands, wanted) for branch in branches]
+    chosen = results[0]
+    avals = branches[0].out_avals
+    for number, other in enumerate(results[1:], start=1):
+        reached = map_scalar("ge", as_objects(which), number, dtype=bool).item()
+        chosen = [
+            a if a is None else _select(reached, a, b, aval) for a, b, aval in zip(chosen, other, avals, strict=True)
+        ]
+    return chosen
+
+
+def _select(which, on_false, on_true, aval):
+    which = np.full(aval.shape, which, object)
+    result = map_scalar("select_n", which, as_objects(on_false), as_objects(on_true), dtype=aval.dtype)
+    return result
+
+
+def _while(operands, wanted, *, cond_nconsts, cond_jaxpr, body_nconsts, body_jaxpr):
+    """A loop whose number of rounds is known; one that depends on the data has no scalar form."""
+    cond_consts, body_consts = operands[:cond_nconsts], operands[cond_nconsts : cond_nconsts + body_nconsts]
+    carry = operands[cond_nconsts + body_nconsts :]
+    while True:
+        (go_on,) = evaluate(cond_jaxpr.jaxpr, cond_jaxpr.consts, [*cond_consts, *carry])
+        if not is_numeric(go_on):
+            raise UnsupportedPrimitive("while: the number of rounds depends on the data")
+        if not go_on:
+            return carry
+        carry = evaluate(body_jaxpr.jaxpr, body_jaxpr.consts, [*body_consts, *carry])
+
+
+CONTROL = {
+    "jit": _call,
+    "pjit": _call,
+    "closed_call": _call,
+    "core_call": _call,
+    "remat": _call,
+    "checkpoint": _call,
+    "custom_jvp_call": _call,
+    "custom_vjp_call": _call,
+    "custom_vjp_call_jaxpr": _call,
+    "scan": _scan,
+    "cond": _cond,
+    "while": _while,
+}
