@@ -23,9 +23,9 @@ import numpy as np
 
 Scalar = Union["Expression", float, int, bool]
 
-# Constants closer than this to 0 or 1, relative to what they were made of, are 0 or 1: what the rounding of 1 / sqrt(2) in a
-# quaternion leaves behind would otherwise keep terms alive that are not there.
-ROUNDING = 4 * float(np.finfo(np.float32).eps)
+# Constants are taken as equal, as 0 or as 1 if they differ by so many units in the last place of what they were made
+# of: what the rounding of 1 / sqrt(2) in a quaternion leaves behind would else keep terms alive that are not there.
+ROUNDING = 4
 
 COMMUTATIVE = frozenset({"add", "mul", "max", "min", "and", "or", "xor", "eq", "ne"})
 
@@ -119,6 +119,8 @@ def fold(op: str, *args, dtype: np.dtype, params: tuple = ()):
     """The value of a primitive on numpy arrays or Python numbers; of the latter a Python number."""
     with np.errstate(all="ignore"):
         value = np.asarray(NUMPY[op](*args, **dict(params)), dtype=dtype)
+    if op in ("add", "sub") and dtype.kind == "f":
+        value = snap(value, np.maximum(*map(np.abs, args)))
     return value if value.ndim or any(isinstance(arg, np.ndarray) for arg in args) else value.item()
 
 
@@ -186,14 +188,14 @@ def split_constant(x: Scalar) -> tuple[float, Scalar]:
 def add(x: Scalar, y: Scalar) -> Scalar:
     """x + y, as a difference where one of them is negative; constants are collected, common factors taken out."""
     if is_constant(x) and is_constant(y):
-        return snap(x + y, x, y)
+        return x + y
     if is_constant(y):
         x, y = y, x
     if is_constant(x):
         return _shift(x, y)
     (a, u), (b, v) = split_constant(x), split_constant(y)
     if not (_is_number(a, 0) and _is_number(b, 0)):
-        return _shift(snap(a + b, a, b), add(u, v))
+        return _shift(_sum(a, b, x), add(u, v))
     if _is(x, "neg"):
         return sub(y, x.args[0])
     if _is(y, "neg"):
@@ -204,14 +206,14 @@ def add(x: Scalar, y: Scalar) -> Scalar:
 def sub(x: Scalar, y: Scalar) -> Scalar:
     """x - y = x + (-y), written as a difference."""
     if is_constant(x) and is_constant(y):
-        return snap(x - y, x, y)
+        return x - y
     if x is y:
         return x.dtype.type(0).item()
     if is_constant(x) or is_constant(y) or _is(y, "neg"):
         return add(x, neg(y))
     (a, u), (b, v) = split_constant(x), split_constant(y)
     if not (_is_number(a, 0) and _is_number(b, 0)):
-        return _shift(snap(a - b, a, b), sub(u, v))
+        return _shift(_sum(a, -b, x), sub(u, v))
     if _is(x, "neg"):
         return neg(add(x.args[0], y))
     return _first(_common_factor(x, y, -1), lambda: _new("sub", x, y))
@@ -219,20 +221,31 @@ def sub(x: Scalar, y: Scalar) -> Scalar:
 
 def _shift(c: float, y: Scalar) -> Scalar:
     """c + y of a constant c."""
-    b, v = split_constant(y) if isinstance(y, Expression) else (y, 0)
-    c = snap(c + b, c, b)
-    if _is_number(v, 0):
-        return c
+    if is_constant(y):
+        return c + y
+    b, v = split_constant(y)
+    c = _sum(c, b, y)
     if c == 0:
         return v
     return _new("sub", c, v.args[0]) if v.op == "neg" else _new("add", c, v)
 
 
-def snap(result: float, *terms: float) -> float:
-    """A constant, exactly 0 where a sum of constants differs from 0 by its rounding only."""
-    if isinstance(result, float) and abs(result) <= ROUNDING * max(map(abs, terms), default=0.0):
-        return 0.0
-    return result
+def snap(result: np.ndarray, size: np.ndarray) -> np.ndarray:
+    """Sums of constants, exactly 0 where they differ from 0 by the rounding of terms of that size only."""
+    return np.where(np.abs(result) <= ROUNDING * np.finfo(result.dtype).eps * size, 0, result).astype(result.dtype)
+
+
+def _sum(a: float, b: float, like: Expression) -> float:
+    """a + b of constants beside an expression, 0 where it is that but for rounding."""
+    result = a + b
+    return 0 * result if _same(a, -b, like) else result
+
+
+def _same(a: float, b: float, like: Expression) -> bool:
+    """Whether two constants beside an expression are equal but for rounding."""
+    if like.dtype.kind != "f":
+        return a == b
+    return abs(a - b) <= ROUNDING * float(np.finfo(like.dtype).eps) * max(abs(a), abs(b))
 
 
 def _first(found: Scalar | None, otherwise: Callable[[], Scalar]) -> Scalar:
@@ -244,10 +257,10 @@ def _common_factor(x: Scalar, y: Scalar, sign: int) -> Scalar | None:
     (a, u), (b, v) = split_coefficient(x), split_coefficient(y)
     b = sign * b
     if u is v:
-        return mul(snap(a + b, a, b), u)
-    if abs(a) != abs(b) or not _floating(u):
+        return mul(_sum(a, b, u), u)
+    if not _same(abs(a), abs(b), u) or u.dtype.kind != "f":
         return None
-    sign = 1 if a == b else -1
+    sign = 1 if a * b > 0 else -1
     identity = _angle_sum(u, v, sign)
     if identity is not None:
         return mul(a, identity)
@@ -320,8 +333,8 @@ def _scale(c: float, y: Expression) -> Scalar:
     """c y of a constant c."""
     b, v = split_coefficient(y)
     c = c * b
-    if isinstance(c, float) and abs(abs(c) - 1) <= ROUNDING:
-        c = math.copysign(1.0, c)
+    if _same(abs(c), 1, y):
+        c = math.copysign(1, c)
     if c == 0:
         return y.dtype.type(0).item()
     if c == 1:

@@ -404,7 +404,10 @@ def _(aval, x, y, *, dimension_numbers, **_):
     x = x.transpose([*batch_x, *free_x, *contract_x]).reshape(batch, rows, inner)
     y = y.transpose([*batch_y, *free_y, *contract_y]).reshape(batch, columns, inner)
     if is_numeric(x, y):
-        return np.einsum("brk,bck->brc", x, y).astype(aval.dtype).reshape(aval.shape)
+        result = np.einsum("brk,bck->brc", x, y).astype(aval.dtype)
+        if aval.dtype.kind == "f":
+            result = expressions.snap(result, np.einsum("brk,bck->brc", np.abs(x), np.abs(y)))
+        return result.reshape(aval.shape)
     x, y = as_objects(x), as_objects(y)
     zero = aval.dtype.type(0).item()
     elements = [
