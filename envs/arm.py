@@ -21,7 +21,7 @@ from flax import struct
 
 from envs.base import ASSETS, MjxEnv, State, initial_state
 from envs.options import OptionError, option
-from envs.physics import load_spec
+from envs.physics import PHYSICS, load_spec
 
 PULL = 1.0  # weight [m] of the distance beside its square in the precise reward
 STANDARD_GRAVITY = 9.81  # [m/s^2]
@@ -51,6 +51,7 @@ class ArmConfig:
     success_radius: float = option(0.05, "distance that counts as reached [m]", above=0)
     dt: float = option(0.05, "time between two actions [s]", above=0, at_most=1)
     num_substeps: int = option(5, "physics steps between two actions", at_least=1)
+    physics: str = option("scalar", "MJX's step as scalar equations, or as it is", choices=PHYSICS)
     episode_length: int = option(100, "steps until the time limit", at_least=1)
 
     def __post_init__(self):
@@ -101,7 +102,7 @@ class Arm(MjxEnv):
     def __init__(self, config: ArmConfig = ArmConfig()):
         self.config = config
         self.lengths = (config.upper_length, config.fore_length)
-        super().__init__(_spec(config), config.num_substeps)
+        super().__init__(_spec(config), config.num_substeps, config.physics)
 
     def reset(self, rng: jax.Array) -> State:
         """q ~ U(-pi, pi)^2 at rest, goal uniform over the ring's area."""

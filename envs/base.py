@@ -18,7 +18,7 @@ import jax
 import jax.numpy as jnp
 from flax import struct
 
-from envs.physics import compile_model, mjx_step
+from envs.physics import compile_model, compile_step
 
 ASSETS = Path(__file__).parent / "assets"
 
@@ -50,12 +50,13 @@ class MjxEnv:
     Args:
       spec: the MuJoCo specification, already edited to the environment's options.
       num_substeps: physics steps between two actions.
+      physics: how they are computed: "scalar" (equations made of MJX's step) or "mjx" (that step itself).
     """
 
-    def __init__(self, spec: Any, num_substeps: int = 1):
+    def __init__(self, spec: Any, num_substeps: int = 1, physics: str = "scalar"):
         self.model = compile_model(spec)
         self.dt = self.model.opt.timestep * num_substeps
-        self.physics_step = mjx_step(self.model, num_substeps)
+        self.physics_step = compile_step(self.model, num_substeps, physics=physics)
 
     @property
     def observation_size(self) -> int:

@@ -19,7 +19,7 @@ from flax import struct
 
 from envs.base import ASSETS, MjxEnv, State, initial_state
 from envs.options import option
-from envs.physics import load_spec
+from envs.physics import PHYSICS, load_spec
 
 
 @dataclass(frozen=True)
@@ -32,6 +32,7 @@ class PendulumConfig:
     torque_limit: float = option(2.0, "largest torque, reached at |action| = 1 [N m]", above=0)
     speed_limit: float = option(8.0, "angular speed is clipped to this [rad/s]", above=0)
     dt: float = option(0.05, "time between two actions, one physics step [s]", above=0, at_most=1)
+    physics: str = option("scalar", "MJX's step as scalar equations, or as it is", choices=PHYSICS)
     episode_length: int = option(200, "steps until the time limit", at_least=1)
 
 
@@ -69,7 +70,7 @@ class Pendulum(MjxEnv):
 
     def __init__(self, config: PendulumConfig = PendulumConfig()):
         self.config = config
-        super().__init__(_spec(config))
+        super().__init__(_spec(config), physics=config.physics)
 
     def reset(self, rng: jax.Array) -> State:
         """theta ~ U(-pi, pi), theta' ~ U(-1, 1)."""

@@ -40,24 +40,26 @@ def test_steps_are_gymnasiums(env):
         np.testing.assert_allclose(mine, np.array(true), rtol=1e-5, atol=1e-5)
 
 
-def test_episodes_are_gymnasiums(env):
-    """A whole episode from Gymnasium's start under the same torques: the same rewards, truncated at the same step."""
+def test_episodes_are_gymnasiums():
+    """A whole episode in float64 from Gymnasium's start under the same torques: the same rewards and time limit."""
     theirs = gymnasium.make("Pendulum-v1")
     theirs.reset(seed=0)
     start = theirs.unwrapped.state
-    vector = vectorize(env, 1, envs.REGISTRY["pendulum"].config().episode_length)
-    state = vector.reset(jax.random.key(0))
-    state = state._replace(
-        env=state.env.replace(pipeline_state=PendulumState(*(jnp.full((1, 1), x, jnp.float32) for x in start)))
-    )
-    ours_step = jax.jit(vector.step)
-    for t in range(200):
-        action = np.sin(0.1 * t)
-        obs, reward, _, truncated, _ = theirs.step(np.array([2.0 * action]))
-        state, outcome = ours_step(state, jnp.full((1, 1), action, jnp.float32), jax.random.key(t))
-        assert bool(outcome.truncated[0]) == truncated == (t == 199)
-        np.testing.assert_allclose(outcome.reward[0], reward, atol=2e-3)  # rounding grows over a swing
-        np.testing.assert_allclose(outcome.next_obs[0], obs, atol=2e-3)
+    with jax.enable_x64(True):
+        vector = vectorize(envs.make("pendulum"), 1, envs.REGISTRY["pendulum"].config().episode_length)
+        state = vector.reset(jax.random.key(0))
+        state = state._replace(
+            env=state.env.replace(pipeline_state=PendulumState(*(jnp.full((1, 1), x) for x in start)))
+        )
+        ours_step = jax.jit(vector.step)
+        for t in range(200):
+            action = np.sin(0.1 * t)
+            # Gymnasium rounds the observation, and nothing else, to float32.
+            obs, reward, _, truncated, _ = theirs.step(np.array([2.0 * action]))
+            state, outcome = ours_step(state, jnp.full((1, 1), action), jax.random.key(t))
+            assert bool(outcome.truncated[0]) == truncated == (t == 199)
+            np.testing.assert_allclose(outcome.reward[0], reward, atol=1e-9)
+            np.testing.assert_allclose(outcome.next_obs[0], obs, atol=1e-6)
 
 
 def test_reset_distribution(env):

@@ -1,5 +1,17 @@
-"""What moves the environments: one step of a MuJoCo model as a function of (qpos, qvel, ctrl)."""
+"""What moves the environments: one step of a MuJoCo model as a function of the few arrays that change."""
 
-from envs.physics.mjx_step import MujocoModelError, compile_model, load_spec, mjx_step
+from envs.physics.models import MujocoModelError, compile_model, ignored_features, load_spec
+from envs.physics.rules import UnsupportedPrimitive
+from envs.physics.scalarize import scalarize
+from envs.physics.step import PHYSICS, compile_step
 
-__all__ = ["MujocoModelError", "compile_model", "load_spec", "mjx_step"]
+__all__ = [
+    "PHYSICS",
+    "MujocoModelError",
+    "UnsupportedPrimitive",
+    "compile_model",
+    "compile_step",
+    "ignored_features",
+    "load_spec",
+    "scalarize",
+]

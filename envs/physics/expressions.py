@@ -232,7 +232,7 @@ def _shift(c: float, y: Scalar) -> Scalar:
 
 def snap(result: np.ndarray, size: np.ndarray) -> np.ndarray:
     """Sums of constants, exactly 0 where they differ from 0 by the rounding of terms of that size only."""
-    return np.where(np.abs(result) <= ROUNDING * np.finfo(result.dtype).eps * size, 0, result).astype(result.dtype)
+    return np.where(np.abs(result) < ROUNDING * np.finfo(result.dtype).eps * size, 0, result).astype(result.dtype)
 
 
 def _sum(a: float, b: float, like: Expression) -> float:
@@ -282,10 +282,12 @@ def _angle_sum(u: Expression, v: Expression, sign: int) -> Scalar | None:
         if kinds[0] == "coscos":
             return _trigonometric("cos", sub(a, b) if sign > 0 else add(a, b))
         return _trigonometric("cos", sub(a, b)) if sign > 0 else neg(_trigonometric("cos", add(a, b)))
-    if "sincos" in (kinds[0], kinds[0][3:] + kinds[0][:3]) and kinds[1] in ("sincos", "cossin"):
-        (s1, c1), (s2, c2) = ((a, b) if k == "sincos" else (b, a) for k, (a, b) in zip(kinds, ((a, b), (c, d))))
-        if s1 is c2 and c1 is s2:
-            return _trigonometric("sin", add(s1, c1) if sign > 0 else sub(s1, c1))
+    if set(kinds) <= {"sincos", "cossin"}:
+        (sin_1, cos_1), (sin_2, cos_2) = (
+            angles if kind == "sincos" else angles[::-1] for kind, angles in zip(kinds, ((a, b), (c, d)), strict=True)
+        )
+        if sin_1 is cos_2 and cos_1 is sin_2:
+            return _trigonometric("sin", add(sin_1, cos_1) if sign > 0 else sub(sin_1, cos_1))
     return None
 
 
@@ -503,7 +505,9 @@ NUMPY: dict[str, Callable[..., Any]] = {
     "xor": np.bitwise_xor,
     "not": np.invert,
     "nextafter": np.nextafter,
-    "select_n": lambda which, *cases: np.choose(which, cases) if len(cases) > 2 else np.where(which, cases[1], cases[0]),
+    "select_n": lambda which, *cases: (
+        np.choose(which, cases) if len(cases) > 2 else np.where(which, cases[1], cases[0])
+    ),
     "convert_element_type": lambda x, new_dtype: x,
     "clamp": lambda low, x, high: np.minimum(np.maximum(x, low), high),
 }

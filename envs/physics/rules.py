@@ -1,11 +1,12 @@
 """One rule per jax primitive: what it does to arrays of scalar expressions.
 
-A rule takes numpy arrays and the primitive's parameters, and gives the results as a tuple of numpy arrays. An array is either
-numeric (all its elements are known) or of dtype object, with an `Expression` or a Python number in every place. Most rules need
-not know which: moving elements about is the same for both, and object arrays do arithmetic with the elements' operators.
+A rule takes numpy arrays and the primitive's parameters, and gives the results as a tuple of numpy arrays. An array
+is either numeric (all its elements are known) or of dtype object, with an `Expression` or a Python number in every
+place. Most rules need not know which: moving elements about is the same for both, and object arrays do arithmetic
+with the elements' operators.
 
-Adding a primitive is adding one function here: `@rule("name")` above `def _(aval, x, y, *, parameter)`, where `aval` has the
-shape and dtype of the (first) result. A primitive without a rule raises `UnsupportedPrimitive`.
+Adding a primitive is adding one function here: `@rule("name")` above `def _(aval, x, y, *, parameter)`, where `aval`
+has the shape and dtype of the (first) result. A primitive without a rule raises `UnsupportedPrimitive`.
 """
 
 from __future__ import annotations
@@ -16,10 +17,10 @@ import operator
 from collections.abc import Callable
 from typing import Any
 
+import jax
 import numpy as np
 
-from envs.physics import expressions
-from envs.physics.expressions import NUMPY, Expression
+from envs.physics.expressions import NUMPY, Expression, apply, fold, snap
 
 Array = np.ndarray
 
@@ -57,16 +58,16 @@ MEANINGFUL = {"round": ("rounding_method",), "integer_pow": ("y",), "convert_ele
 
 
 def _elementwise(name: str):
-    def apply(aval, *arrays, **params):
+    def elementwise(aval, *arrays, **params):
         params = tuple((key, _hashable(params[key])) for key in MEANINGFUL.get(name, ()))
         if is_numeric(*arrays):
-            return expressions.fold(name, *arrays, dtype=aval.dtype, params=params)
-        function = functools.partial(expressions.apply, name, dtype=np.dtype(aval.dtype), params=params)
+            return fold(name, *arrays, dtype=aval.dtype, params=params)
+        function = functools.partial(apply, name, dtype=np.dtype(aval.dtype), params=params)
         arrays = np.broadcast_arrays(*map(as_objects, arrays))
         elements = [function(*operands) for operands in zip(*(array.flat for array in arrays), strict=True)]
         return pack(elements, aval.shape)
 
-    return apply
+    return elementwise
 
 
 def _hashable(parameter):
@@ -86,18 +87,13 @@ def pack(elements: list, shape: tuple[int, ...]) -> Array:
 
 def map_scalar(name: str, x: Array, *others: Array, dtype) -> Array:
     """An elementwise primitive applied inside another rule, to object arrays."""
-    function = functools.partial(expressions.apply, name, dtype=np.dtype(dtype))
+    function = functools.partial(apply, name, dtype=np.dtype(dtype))
     return np.asarray(np.frompyfunc(function, 1 + len(others), 1)(x, *others), object)
 
 
-@rule("copy", "copy_p", "stop_gradient", "optimization_barrier")
+@rule("copy", "optimization_barrier")
 def _(aval, x, **_):
     return x
-
-
-@rule("erf_inv", "erf")
-def _(aval, x, **_):
-    raise UnsupportedPrimitive("erf: no numpy counterpart")
 
 
 # --- moving elements --------------------------------------------------------------------------------------------------
@@ -111,7 +107,7 @@ def _(aval, x, *, shape, broadcast_dimensions, **_):
     return np.broadcast_to(x.reshape(inner), shape)
 
 
-@rule("reshape", "squeeze", "expand_dims")
+@rule("reshape", "squeeze")
 def _(aval, x, **_):
     return x.reshape(aval.shape)
 
@@ -176,6 +172,13 @@ def _alike(arrays):
     return arrays if is_numeric(*arrays) else tuple(map(as_objects, arrays))
 
 
+@rule("platform_index")
+def _(aval, *, platforms):
+    """Which of the implementations for different platforms is the one for this one; they compute the same."""
+    here = next((i for i, names in enumerate(platforms) if names is None or jax.default_backend() in names), 0)
+    return np.asarray(here, aval.dtype)
+
+
 @rule("dynamic_slice")
 def _(aval, x, *start, slice_sizes):
     limits = np.subtract(x.shape, slice_sizes)
@@ -217,7 +220,7 @@ def _choose(index: Expression, cases: list[Array], aval) -> Array:
     """cases[index], the index clamped into the range, as selects."""
     chosen = as_objects(cases[0])
     for at, case in enumerate(cases[1:], start=1):
-        reached = expressions.apply("ge", index, at, dtype=np.dtype(bool))
+        reached = apply("ge", index, at, dtype=np.dtype(bool))
         which = np.full(chosen.shape, reached, object)
         chosen = map_scalar("select_n", which, chosen, as_objects(case), dtype=aval.dtype)
     return pack(list(chosen.flat), aval.shape)
@@ -252,7 +255,7 @@ def _out_of_bounds_value(dtype):
     return np.nan if np.issubdtype(dtype, np.floating) else np.iinfo(dtype).min
 
 
-@rule("scatter", "scatter-add", "scatter_add", "scatter-sub", "scatter-mul", "scatter_mul", "scatter-min", "scatter-max")
+@rule("scatter", "scatter-add", "scatter-sub", "scatter-mul", "scatter-min", "scatter-max")
 def _(aval, x, indices, updates, *, dimension_numbers, mode, update_jaxpr, **_):
     if not is_numeric(indices):
         raise UnsupportedPrimitive("scatter: an index depends on the data")
@@ -305,7 +308,7 @@ def _reduction(name: str):
             return _NUMERIC_REDUCTIONS[name](x, tuple(axes)).astype(aval.dtype)
         rest = [d for d in range(x.ndim) if d not in axes]
         rows = x.transpose([*rest, *axes]).reshape(-1, int(np.prod([x.shape[d] for d in axes], dtype=int)))
-        function = functools.partial(expressions.apply, name, dtype=np.dtype(aval.dtype))
+        function = functools.partial(apply, name, dtype=np.dtype(aval.dtype))
         return pack([tree(function, list(row)) for row in rows], aval.shape)
 
     return reduce
@@ -342,7 +345,7 @@ def tree(function: Callable, items: list):
 
 def _cumulative(name: str):
     def cumulate(aval, x, *, axis, reverse):
-        function = functools.partial(expressions.apply, name, dtype=np.dtype(aval.dtype))
+        function = functools.partial(apply, name, dtype=np.dtype(aval.dtype))
         lines = np.moveaxis(as_objects(x), axis, -1)
         lines = lines[..., ::-1] if reverse else lines
         result = np.empty(lines.shape, object)
@@ -362,20 +365,22 @@ def _arg_extremum(better: str):
     def search(aval, x, *, axes, index_dtype, **_):
         (axis,) = axes
         lines = np.moveaxis(as_objects(x), axis, -1)
-        return pack([_first_best(better, list(lines[place])) for place in np.ndindex(*lines.shape[:-1])], aval.shape)
+        places = np.ndindex(*lines.shape[:-1])
+        return pack([_first_best(better, list(lines[place]), np.dtype(index_dtype)) for place in places], aval.shape)
 
     return search
 
 
-def _first_best(better: str, items: list):
+def _first_best(better: str, items: list, index_dtype: np.dtype):
     """The place of the first extremum; of the first NaN if there is one."""
-    truth = functools.partial(expressions.apply, dtype=np.dtype(bool))
+    dtype = next((item.dtype for item in items if isinstance(item, Expression)), np.dtype(float))
+    truth = functools.partial(apply, dtype=np.dtype(bool))
     best, index = items[0], 0
     for i, item in enumerate(items[1:], start=1):
         first_nan = truth("and", truth("ne", item, item), truth("eq", best, best))
         found = truth("or", truth(better, item, best), first_nan)
-        best = expressions.apply("select_n", found, best, item, dtype=np.dtype(float))
-        index = expressions.apply("select_n", found, index, i, dtype=np.dtype(np.int32))
+        best = apply("select_n", found, best, item, dtype=dtype)
+        index = apply("select_n", found, index, i, dtype=index_dtype)
     return index
 
 
@@ -406,7 +411,7 @@ def _(aval, x, y, *, dimension_numbers, **_):
     if is_numeric(x, y):
         result = np.einsum("brk,bck->brc", x, y).astype(aval.dtype)
         if aval.dtype.kind == "f":
-            result = expressions.snap(result, np.einsum("brk,bck->brc", np.abs(x), np.abs(y)))
+            result = snap(result, np.einsum("brk,bck->brc", np.abs(x), np.abs(y)))
         return result.reshape(aval.shape)
     x, y = as_objects(x), as_objects(y)
     zero = aval.dtype.type(0).item()
@@ -426,7 +431,7 @@ def _(aval, x, **_):
     x, size = as_objects(x), x.shape[-1]
     for batch in np.ndindex(*x.shape[:-2]):
         lower = result[batch]
-        for i, j in ((i, j) for i in range(size) for j in range(i + 1)):
+        for i, j in zip(*np.tril_indices(size), strict=True):
             rest = x[batch][i, j] - sum(lower[i, :j] * lower[j, :j])
             lower[i, j] = _scalar("sqrt", rest, aval) if i == j else _scalar("div", rest, lower[j, j], aval)
     return result
@@ -434,7 +439,7 @@ def _(aval, x, **_):
 
 def _scalar(name, *operands_and_aval):
     *operands, aval = operands_and_aval
-    return expressions.apply(name, *operands, dtype=np.dtype(aval.dtype))
+    return apply(name, *operands, dtype=np.dtype(aval.dtype))
 
 
 @rule("triangular_solve")

@@ -1,10 +1,10 @@
 """A function of small arrays turned into the same function as scalar equations.
 
-`scalarize(fn, *example_args)` traces `fn` to a jaxpr and interprets it once, with every array replaced by its elements: a number
-where the element is known, an `Expression` where it depends on the arguments. Slicing, gathering, padding and stacking then
-cost nothing, products with 0 vanish, small dot products, factorisations and fixed-length loops are written out, and
-what is used by nobody is dropped. What is left is handed to XLA as scalar operations, which under `vmap` are
-operations on contiguous vectors of the batch.
+`scalarize(fn, *example_args)` traces `fn` to a jaxpr and interprets it once, with every array replaced by its
+elements: a number where the element is known, an `Expression` where it depends on the arguments. Slicing, gathering,
+padding and stacking then cost nothing, products with 0 vanish, small dot products, factorisations and fixed-length
+loops are written out, and what is used by nobody is dropped. What is left is handed to XLA as scalar operations,
+which under `vmap` are operations on contiguous vectors of the batch.
 """
 
 from __future__ import annotations
@@ -52,7 +52,8 @@ def scalarize(fn: Callable, *example_args: Any) -> Callable:
 class Program:
     """Scalar equations with named ends: what `trace` makes of a function.
 
-    The three steps of a call are apart, so that a loop over the program can carry the elements and leave the arrays outside.
+    The three steps of a call are apart, so that a loop over the program can carry the elements and leave the arrays
+    outside.
 
     Attributes:
       inputs: one array of input expressions for each leaf of the arguments.
@@ -126,9 +127,7 @@ def evaluate(jaxpr, consts, args, wanted: list[bool] | None = None) -> list:
     for equation, wanted_here in _needed(jaxpr, outvars):
         operands = [_read(values, var) for var in equation.invars]
         results = interpret(equation, operands, wanted_here)
-        values.update(
-            (var, value) for var, value in zip(equation.outvars, results, strict=True) if value is not None
-        )
+        values.update((var, value) for var, value in zip(equation.outvars, results, strict=True) if value is not None)
     return [_read(values, var) if wanted is None or wanted[i] else None for i, var in enumerate(jaxpr.outvars)]
 
 
@@ -166,6 +165,7 @@ def interpret(equation, operands: list, wanted: list[bool]) -> list:
 
 def _settle(array: np.ndarray, dtype) -> np.ndarray:
     """A numeric array where nothing in it depends on the data any more."""
+    array = np.asarray(array)
     if array.dtype == object and not any(isinstance(x, Expression) for x in array.flat):
         return array.astype(dtype)
     return array
@@ -190,8 +190,7 @@ def _scan(operands, wanted, *, jaxpr, length, reverse, num_consts, num_carry, **
         rows.append(results[num_carry:])
     rows = rows[::-1] if reverse else rows
     stacked = [
-        np.stack(column if is_numeric(*column) else list(map(as_objects, column)))
-        for column in zip(*rows, strict=True)
+        np.stack(column if is_numeric(*column) else list(map(as_objects, column))) for column in zip(*rows, strict=True)
     ] or [np.zeros((0, *var.aval.shape), var.aval.dtype) for var in jaxpr.jaxpr.outvars[num_carry:]]
     return [*carry, *stacked]
 
@@ -234,14 +233,9 @@ def _while(operands, wanted, *, cond_nconsts, cond_jaxpr, body_nconsts, body_jax
 
 CONTROL = {
     "jit": _call,
-    "pjit": _call,
-    "closed_call": _call,
-    "core_call": _call,
-    "remat": _call,
-    "checkpoint": _call,
+    "remat2": _call,
     "custom_jvp_call": _call,
     "custom_vjp_call": _call,
-    "custom_vjp_call_jaxpr": _call,
     "scan": _scan,
     "cond": _cond,
     "while": _while,

@@ -1,11 +1,11 @@
 """How a program of scalar equations is handed to XLA so that it runs fast.
 
-XLA compiles a group of elementwise operations into one loop for every result that leaves the group, and computes what two results
-share once in each of their loops. Left alone it makes of a whole physics step a few loops that repeat nearly
-everything. So here it is decided which values are stored: those that would cost more to compute again than to write and read.
-Every loop then computes one stored value from stored ones. The stored values are put into stages by their depth; a stage is a call
-that XLA may not inline, so its loops neither merge with nor repeat those of another stage. Under `vmap` a stored value is
-one contiguous vector of the batch.
+XLA compiles a group of elementwise operations into one loop for every result that leaves the group, and computes what
+two results share once in each of their loops. Left alone it makes of a whole physics step a few loops that repeat
+nearly everything. So here it is decided which values are stored: those that would cost more to compute again than to
+write and read. Every loop then computes one stored value from stored ones. The stored values are put into stages by
+their depth; a stage is a call that XLA may not inline, so its loops neither merge with nor repeat those of another
+stage. Under `vmap` a stored value is one contiguous vector of the batch.
 """
 
 from __future__ import annotations
@@ -19,7 +19,8 @@ import jax
 import numpy as np
 from jax import lax
 
-# Attaching metadata has no stable home in jax yet; without it stages still compute the same, slower, as XLA inlines them.
+# Attaching metadata has no stable home in jax yet; without it stages still compute the same, slower, as XLA inlines
+# them.
 from jax.experimental.xla_metadata import set_xla_metadata
 
 from envs.physics.expressions import Expression
@@ -27,8 +28,8 @@ from envs.physics.trigonometry import sincos
 
 # What a value costs to compute, in additions.
 COST = {"sin": 12, "cos": 12, "div": 4, "sqrt": 4, "rsqrt": 8, "pow": 20, "exp": 10, "log": 10, "tanh": 12, "atan2": 30}
-# What it costs to write a value and read it again. Measured: of a two-link arm and a seven-joint arm at 1,024 environments, both are
-# fastest between 8 and 16 and within a third of that from 2 to 32.
+# What it costs to write a value and read it again. Measured: of a two-link arm and a seven-joint arm at 1,024
+# environments, both are fastest between 8 and 16 and within a third of that from 2 to 32.
 STORING = 10
 
 

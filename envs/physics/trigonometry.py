@@ -1,8 +1,8 @@
 """Sine and cosine of one angle together, as a few products that vectorise.
 
-XLA's own sine and cosine are exact to the last bit but cost as much as a hundred products on a CPU, and physics asks for both of every joint
-angle. In float32 the pair here is within 1.5 units in the last place of 1 of the truth for |x| <= 1e5, at a tenth of the cost; in other
-precisions it is XLA's.
+XLA's own sine and cosine are exact to the last bit but cost as much as a hundred products on a CPU, and physics asks
+for both of every joint angle. In float32 the pair here is within 1.5 units in the last place of 1 of the truth for
+|x| <= 1e5, at a tenth of the cost; in other precisions it is XLA's.
 """
 
 from __future__ import annotations
@@ -14,7 +14,8 @@ from jax import lax
 
 # pi/2 in three pieces, each short enough for its product with a whole number below 2^16 to be exact (Cody and Waite).
 HALF_PI = (1.5703125, 4.837512969970703125e-4, 7.54978995489188216e-8)
-# (sin(r) - r) / r^3 and (cos(r) - 1 + r^2 / 2) / r^4 in powers of r^2, |r| <= pi/4 (S. Moshier, Cephes, single precision).
+# (sin(r) - r) / r^3 and (cos(r) - 1 + r^2 / 2) / r^4 in powers of r^2, |r| <= pi/4 (S. Moshier, Cephes, single
+# precision).
 SIN = (-1.6666654611e-1, 8.3321608736e-3, -1.9515295891e-4)
 COS = (4.166664568298827e-2, -1.388731625493765e-3, 2.443315711809948e-5)
 

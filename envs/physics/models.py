@@ -1,0 +1,109 @@
+"""MuJoCo models: read, compiled, and checked against what MJX makes of them."""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import logging
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+if TYPE_CHECKING:
+    import mujoco
+
+logger = logging.getLogger(__name__)
+
+# Fields of mjModel that MJX 3.17 never reads: what they ask for is not simulated when one of them is not 0.
+IGNORED_FIELDS = {
+    "geom_surfacevel": "surface velocity of geoms",
+    "geom_adhesion": "adhesion of geoms",
+    "geom_gap": "gap of geoms",
+    "pair_adhesion": "adhesion of contact pairs",
+    "pair_gap": "gap of contact pairs",
+    "jnt_stiffnesspoly": "higher stiffness coefficients of joints",
+    "dof_dampingpoly": "higher damping coefficients of joints",
+    "tendon_stiffnesspoly": "higher stiffness coefficients of tendons",
+    "tendon_dampingpoly": "higher damping coefficients of tendons",
+    "actuator_delay": "delay of actuators",
+    "actuator_damping": "damping of actuators",
+    "actuator_armature": "armature of actuators",
+    "sensor_delay": "delay of sensors",
+    "sensor_interval": "sampling interval of sensors",
+}
+# Sensors of forces and accelerations: MJX leaves them at 0 in a model that has no constraint.
+ACCELERATION_SENSORS = ("ACCELEROMETER", "FORCE", "TORQUE", "FRAMELINACC", "FRAMEANGACC")
+
+
+class MujocoModelError(ValueError):
+    """A model file that MuJoCo cannot read or compile, or that MJX cannot step."""
+
+
+def load_spec(path: str | Path) -> mujoco.MjSpec:
+    """The editable specification in an MJCF file.
+
+    Raises:
+      MujocoModelError: the file is missing or is not MJCF; MuJoCo's own message, which has the line, after the path.
+    """
+    import mujoco
+
+    try:
+        return mujoco.MjSpec.from_file(str(path))
+    except (ValueError, OSError) as error:
+        raise MujocoModelError(f"{path}: {' '.join(str(error).split())}") from error
+
+
+def compile_model(spec: mujoco.MjSpec) -> mujoco.MjModel:
+    """The compiled model of a specification; raises MujocoModelError with MuJoCo's message where it has none."""
+    try:
+        return spec.compile()
+    except ValueError as error:
+        raise MujocoModelError(f"{spec.modelname}: {' '.join(str(error).split())}") from error
+
+
+def model_name(model: mujoco.MjModel) -> str:
+    """The name in the MJCF: the first of MuJoCo's zero-terminated names."""
+    return model.names.split(b"\0", 1)[0].decode() or "MuJoCo model"
+
+
+def put_model(model: mujoco.MjModel):
+    """MJX's model; raises MujocoModelError with the name of what MJX does not support."""
+    try:
+        return import_mjx().put_model(model)
+    except (NotImplementedError, ValueError) as error:
+        raise MujocoModelError(f"{model_name(model)}: MJX cannot step it: {error}") from error
+
+
+def import_mjx():
+    """`mujoco.mjx`, imported where it is first needed and without its two printed lines about Warp.
+
+    The import takes seconds, which nobody should pay who only asks for `--help`; Warp is its optional GPU backend.
+    """
+    with contextlib.redirect_stdout(io.StringIO()):
+        from mujoco import mjx
+    return mjx
+
+
+def ignored_features(model: mujoco.MjModel) -> list[str]:
+    """What a model asks for and MJX leaves out without a word, one phrase each; empty if there is nothing."""
+    import mujoco
+
+    found = [meaning for field, meaning in IGNORED_FIELDS.items() if np.any(getattr(model, field, 0))]
+    if model.opt.noslip_iterations:
+        found.append("noslip iterations of the solver")
+    if model.opt.disableactuator:
+        found.append("disabled groups of actuators")
+    if model.opt.enableflags & mujoco.mjtEnableBit.mjENBL_SLEEP:
+        found.append("sleeping islands")
+    sensors = {mujoco.mjtSensor(int(kind)).name.removeprefix("mjSENS_") for kind in model.sensor_type}
+    sensors &= set(ACCELERATION_SENSORS)
+    if sensors and not _has_constraints(model):
+        found.append(f"sensors of accelerations and forces without a constraint ({', '.join(sorted(sensors)).lower()})")
+    return found
+
+
+def _has_constraints(model: mujoco.MjModel) -> bool:
+    """Whether MJX makes constraint rows: equalities, friction loss, limits or possible contacts."""
+    mjx = import_mjx()
+    return bool(mjx.make_data(put_model(model))._impl.efc_J.size)

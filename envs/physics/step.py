@@ -1,0 +1,167 @@
+"""One control step of a MuJoCo model, as a function of the few arrays that change.
+
+`compile_step` gives MJX's step as scalar equations (`envs.physics.scalarize`); what has no such form is stepped by
+`mjx.step` itself. Either way it is a function of one environment, and batches are made by `jax.vmap` of it.
+"""
+
+from __future__ import annotations
+
+import copy
+import logging
+from collections.abc import Callable
+from typing import TYPE_CHECKING
+
+import jax
+import jax.numpy as jnp
+
+from envs.physics.models import import_mjx, model_name, put_model
+from envs.physics.rules import UnsupportedPrimitive
+from envs.physics.scalarize import Program, trace
+
+if TYPE_CHECKING:
+    import mujoco
+
+logger = logging.getLogger(__name__)
+
+StepFn = Callable[..., tuple[jax.Array, ...]]
+
+PHYSICS = ("scalar", "mjx")
+STATE = ("qpos", "qvel", "act", "qacc_warmstart", "time")  # what a step hands on to the next one
+MODEL = "model."
+
+
+def compile_step(
+    model: mujoco.MjModel,
+    num_substeps: int = 1,
+    *,
+    inputs: tuple[str, ...] = ("qpos", "qvel", "ctrl"),
+    outputs: tuple[str, ...] = ("qpos", "qvel"),
+    physics: str = "scalar",
+) -> StepFn:
+    """`num_substeps` times `mjx.step` with all but the state held.
+
+    Args:
+      model: a compiled model.
+      num_substeps: physics steps of `model.opt.timestep` seconds in one control step.
+      inputs: what the step is a function of, in this order: fields of `mjx.Data` (qpos, qvel, act, ctrl, mocap_pos,
+        qfrc_applied, qacc_warmstart, ...) and, as `model.` and its name, of `mjx.Model` (model.body_mass,
+        model.dof_damping, model.opt.gravity, ...), for models that differ between the environments. All else is as
+        `mjx.make_data` and the model have it.
+      outputs: the fields of `mjx.Data` that the step returns, in this order, as they are after the last substep. As
+      in MuJoCo, what is derived
+        from the positions (xpos, site_xpos, sensordata, ...) belongs to the state before that substep.
+      physics: "scalar": scalar equations, or `mjx.step` with a logged line that says why if the model has none;
+        "mjx": `mjx.step`.
+
+    Returns:
+      A function of the inputs (SI units; ctrl in the actuators' units) of one environment. A NaN in the state stays
+      in the state.
+
+    Raises:
+      ValueError: the model's state is not among the inputs (activations), or `physics` is unknown.
+      MujocoModelError: MJX cannot step the model.
+    """
+    if physics not in PHYSICS:
+        raise ValueError(f"physics is {physics!r}; it must be one of {', '.join(PHYSICS)}")
+    if model.na and "act" not in inputs:
+        raise ValueError(f"the model has {model.na} actuator activation states, which the inputs {inputs} do not carry")
+    carried = tuple(name for name in inputs if name in STATE)
+    results = carried + tuple(name for name in outputs if name not in carried)
+    once, example = single_step(model, inputs, results)
+    if physics == "scalar":
+        try:
+            repeated = _repeat_program(trace(once, *example), inputs, carried, num_substeps)
+        except UnsupportedPrimitive as error:
+            logger.warning("%s: stepped by mjx.step, not as scalar equations: %s", model_name(model), error)
+            once, _ = single_step(_without_lapack(model), inputs, results)
+            physics = "mjx"
+    if physics == "mjx":
+        repeated = _repeat(once, inputs, carried, num_substeps)
+
+    def step(*arrays):
+        if len(arrays) != len(inputs):
+            raise TypeError(f"the step is a function of {', '.join(inputs)}; got {len(arrays)} arguments")
+        values = dict(zip(results, repeated(arrays), strict=True))
+        return tuple(values[name] for name in outputs)
+
+    return step
+
+
+def single_step(model: mujoco.MjModel, inputs: tuple[str, ...], outputs: tuple[str, ...]) -> tuple[Callable, list]:
+    """`mjx.step` as a function from the named inputs to the named outputs, with example arguments."""
+    mjx = import_mjx()
+    mjx_model = put_model(model)
+    initial = mjx.make_data(mjx_model)
+
+    def step(*arrays):
+        given = dict(zip(inputs, arrays, strict=True))
+        changed = {name.removeprefix(MODEL): x for name, x in given.items() if name.startswith(MODEL)}
+        data = initial.replace(**{name: x for name, x in given.items() if not name.startswith(MODEL)})
+        data = mjx.step(mjx_model.tree_replace(changed), data)
+        return tuple(getattr(data, name) for name in outputs)
+
+    return step, [_field(mjx_model if name.startswith(MODEL) else initial, name) for name in inputs]
+
+
+def _field(owner, name: str) -> jax.Array:
+    for part in name.removeprefix(MODEL).split("."):
+        owner = getattr(owner, part)
+    return jnp.asarray(owner)
+
+
+def _repeat(once: Callable, inputs, carried, num_substeps: int) -> Callable:
+    """The step with its state fed back."""
+
+    def repeated(arrays):
+        def substep(state, _):
+            given = dict(zip(inputs, arrays, strict=True)) | dict(zip(carried, state, strict=True))
+            results = once(*(given[name] for name in inputs))
+            return results[: len(carried)], results[len(carried) :]
+
+        state = tuple(array for name, array in zip(inputs, arrays, strict=True) if name in carried)
+        if num_substeps == 1:
+            state, others = substep(state, None)
+            return (*state, *others)
+        state, others = jax.lax.scan(substep, state, length=num_substeps)
+        return (*state, *(other[-1] for other in others))
+
+    return repeated
+
+
+def _repeat_program(program: Program, inputs, carried, num_substeps: int) -> Callable:
+    """The same for scalar equations; the elements stay apart until the end."""
+    names = [name for name, array in zip(inputs, program.inputs, strict=True) for _ in array.flat]
+    num_carried = sum(name in carried for name in names)
+
+    def repeated(arrays):
+        elements = program.split([jnp.asarray(array) for array in arrays])
+        held = [None if name in carried else x for name, x in zip(names, elements, strict=True)]
+
+        def substep(state, _):
+            state = iter(state)
+            results = program.run([next(state) if x is None else x for x in held])
+            return tuple(results[:num_carried]), tuple(results[num_carried:])
+
+        state = tuple(x for name, x in zip(names, elements, strict=True) if name in carried)
+        if num_substeps == 1:
+            state, others = substep(state, None)
+        else:
+            state, others = jax.lax.scan(substep, state, length=num_substeps)
+            others = tuple(other[-1] for other in others)
+        return tuple(program.join([*state, *others]))
+
+    return repeated
+
+
+def _without_lapack(model: mujoco.MjModel) -> mujoco.MjModel:
+    """The model with sparse matrices and the conjugate-gradient solver, in whose step MJX calls no LAPACK.
+
+    Some jaxlib releases hang when batched LAPACK calls fill their thread pool. Both solvers find the minimum of the
+    same convex function.
+    """
+    import mujoco
+
+    model = copy.copy(model)
+    model.opt.jacobian = mujoco.mjtJacobian.mjJAC_SPARSE
+    model.opt.solver = mujoco.mjtSolver.mjSOL_CG
+    return model
