@@ -40,11 +40,12 @@ TRAINING = {
     "td": {
         "num_envs": 32,
         "num_steps": 16,
-        "total_steps": 4_000_000,
+        "total_steps": 5_000_000,
         "algo.gamma": 0.97,
-        "algo.lambda_": 0.9,
-        "algo.final_lr": 0.05,
+        "algo.lambda_": 0.95,
+        "algo.final_lr": 0.02,
         "algo.reward_scale": 0.02,
+        "network.activation": "relu",
         "network.sigma": 1.0,
     },
     "reinforce": {

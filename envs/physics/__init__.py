@@ -2,7 +2,7 @@
 
 from envs.physics.models import MujocoModelError, compile_model, ignored_features, load_spec
 from envs.physics.rules import UnsupportedPrimitive
-from envs.physics.scalarize import scalarize
+from envs.physics.interpreter import scalarize
 from envs.physics.step import PHYSICS, compile_step
 
 __all__ = [

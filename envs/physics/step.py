@@ -1,6 +1,6 @@
 """One control step of a MuJoCo model, as a function of the few arrays that change.
 
-`compile_step` gives MJX's step as scalar equations (`envs.physics.scalarize`); what has no such form is stepped by
+`compile_step` gives MJX's step as scalar equations (`envs.physics.interpreter`); what has no such form is stepped by
 `mjx.step` itself. Either way it is a function of one environment, and batches are made by `jax.vmap` of it.
 """
 
@@ -16,7 +16,7 @@ import jax.numpy as jnp
 
 from envs.physics.models import import_mjx, model_name, put_model
 from envs.physics.rules import UnsupportedPrimitive
-from envs.physics.scalarize import Program, trace
+from envs.physics.interpreter import Program, trace
 
 if TYPE_CHECKING:
     import mujoco
