@@ -10,8 +10,8 @@ from jax import lax
 
 import envs
 from envs.physics import UnsupportedPrimitive, scalarize
-from envs.physics.rules import RULES
 from envs.physics.interpreter import CONTROL, trace
+from envs.physics.rules import RULES
 from envs.physics.trigonometry import sincos
 
 A = jnp.asarray(np.random.default_rng(0).normal(size=(3, 3)), jnp.float32)

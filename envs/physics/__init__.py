@@ -1,8 +1,8 @@
 """What moves the environments: one step of a MuJoCo model as a function of the few arrays that change."""
 
+from envs.physics.interpreter import scalarize
 from envs.physics.models import MujocoModelError, compile_model, ignored_features, load_spec
 from envs.physics.rules import UnsupportedPrimitive
-from envs.physics.interpreter import scalarize
 from envs.physics.step import PHYSICS, compile_step
 
 __all__ = [

@@ -14,9 +14,9 @@ from typing import TYPE_CHECKING
 import jax
 import jax.numpy as jnp
 
+from envs.physics.interpreter import Program, trace
 from envs.physics.models import import_mjx, model_name, put_model
 from envs.physics.rules import UnsupportedPrimitive
-from envs.physics.interpreter import Program, trace
 
 if TYPE_CHECKING:
     import mujoco
