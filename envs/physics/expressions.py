@@ -5,11 +5,11 @@ operators, so arrays of expressions are plain numpy object arrays and numpy itse
 Every expression is made by `apply`, which
 
   * folds constants,
-  * simplifies: x + 0, x 1, x 0, x - x, c (d x), a x + b x, signs pulled outwards, sin^2 + cos^2, ...,
+  * simplifies: x + 0, x 1, x 0, x - x, x / x, c (d x), a x + b x, signs pulled outwards, sin^2 + cos^2, ...,
   * returns the expression that is already there if the same one was made before in this `Graph`.
 
 The simplifications are those of real numbers. They differ from floating point in rounding, in the sign of zero, and
-where an operand is infinite or NaN: 0 x is 0 here and NaN there. A NaN that matters still comes out, because what does
+where an operand is infinite or NaN, or both of a fraction are 0: 0 x is 0 here and NaN there. A NaN that matters still comes out, because what does
 not vanish as a real function is still computed from it.
 """
 
@@ -100,11 +100,7 @@ def is_constant(x: Scalar) -> bool:
 
 
 def apply(op: str, *args: Scalar, dtype: np.dtype, params: tuple = ()) -> Scalar:
-    """The simplified expression of a jax primitive on scalars; a Python number if all operands are.
-
-    Raises:
-      KeyError: all operands are constants and the primitive is not in `NUMPY`.
-    """
+    """The simplified expression of a jax primitive in `NUMPY` on scalars; a Python number if all operands are."""
     if all(map(is_constant, args)):
         return fold(op, *args, dtype=dtype, params=params)
     if op == "select_n":
@@ -395,8 +391,18 @@ def clamp(low: Scalar, x: Scalar, high: Scalar) -> Scalar:
     return minimum(high, maximum(low, x))
 
 
-def select(which: Scalar, on_false: Scalar, on_true: Scalar, dtype: np.dtype | None = None) -> Scalar:
-    """`on_true` where `which` holds, else `on_false`; one of them if that is known."""
+def power(x: Scalar, y: Scalar) -> Scalar:
+    """x^y; a product if y is a small whole number."""
+    if is_constant(y) and abs(y) <= 8 and y == int(y):
+        return integer_pow(x, int(y))
+    return _new("pow", x, y)
+
+
+def select(which: Scalar, on_false: Scalar, on_true: Scalar, *others: Scalar, dtype: np.dtype | None = None) -> Scalar:
+    """`on_true` where `which` holds, else `on_false`; of more cases the one with the number `which`."""
+    if others:
+        last = apply("ge", which, 1 + len(others), dtype=np.dtype(bool))
+        return select(last, select(which, on_false, on_true, *others[:-1], dtype=dtype), others[-1], dtype=dtype)
     if is_constant(which):
         return on_true if which else on_false
     if on_false is on_true or (
@@ -406,7 +412,7 @@ def select(which: Scalar, on_false: Scalar, on_true: Scalar, dtype: np.dtype | N
     if on_false is False and on_true is True:
         return which
     if _is(which, "not"):
-        return select(which.args[0], on_true, on_false)
+        return select(which.args[0], on_true, on_false, dtype=dtype)
     return _new("select_n", which, on_false, on_true, dtype=dtype)
 
 
@@ -444,6 +450,7 @@ SIMPLIFY: dict[str, Callable[..., Any]] = {
     "mul": mul,
     "div": div,
     "neg": neg,
+    "pow": power,
     "integer_pow": integer_pow,
     "square": lambda x: mul(x, x),
     "max": maximum,

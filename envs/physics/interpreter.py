@@ -214,8 +214,7 @@ def _cond(operands, wanted, *, branches, **_):
 
 def _select(which, on_false, on_true, aval):
     which = np.full(aval.shape, which, object)
-    result = map_scalar("select_n", which, as_objects(on_false), as_objects(on_true), dtype=aval.dtype)
-    return result
+    return map_scalar("select_n", which, as_objects(on_false), as_objects(on_true), dtype=aval.dtype)
 
 
 def _while(operands, wanted, *, cond_nconsts, cond_jaxpr, body_nconsts, body_jaxpr):
