@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 import envs
 from envs.base import ASSETS
-from envs.physics import MujocoModelError, compile_model, compile_step, ignored_features, load_spec
+from envs.physics import MujocoModelError, check_model, compile_model, compile_step, ignored_features, load_spec
 from envs.physics.step import single_step
 
 STATE = ("qpos", "qvel")
@@ -268,3 +268,16 @@ def test_features_that_mjx_leaves_out_are_named():
     found = ignored_features(mujoco.MjModel.from_xml_string(odd))
     for words in ("gap of geoms", "noslip", "groups of actuators", "accelerometer"):
         assert any(words in line for line in found), (words, found)
+
+
+@pytest.mark.parametrize("name", ["arm, upright, velocity", "fixed tendon"])
+def test_models_that_mjx_steps_as_mujoco_does_pass_the_check(name):
+    assert check_model(models.make(name)) == []
+
+
+def test_models_that_mjx_steps_otherwise_fail_the_check():
+    """The damping of an actuator is left out: the check says so, and that it matters."""
+    model = mujoco.MjModel.from_xml_string(models.chain(models.pole(), '<motor joint="pole" damping="3"/>'))
+    left_out, difference = check_model(model)
+    assert "damping of actuators" in left_out
+    assert "differs from C MuJoCo" in difference

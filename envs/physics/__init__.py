@@ -1,5 +1,6 @@
 """What moves the environments: one step of a MuJoCo model as a function of the few arrays that change."""
 
+from envs.physics.check import check_model
 from envs.physics.interpreter import scalarize
 from envs.physics.models import MujocoModelError, compile_model, ignored_features, load_spec
 from envs.physics.rules import UnsupportedPrimitive
@@ -9,6 +10,7 @@ __all__ = [
     "PHYSICS",
     "MujocoModelError",
     "UnsupportedPrimitive",
+    "check_model",
     "compile_model",
     "compile_step",
     "ignored_features",

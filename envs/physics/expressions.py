@@ -9,8 +9,8 @@ Every expression is made by `apply`, which
   * returns the expression that is already there if the same one was made before in this `Graph`.
 
 The simplifications are those of real numbers. They differ from floating point in rounding, in the sign of zero, and
-where an operand is infinite or NaN, or both of a fraction are 0: 0 x is 0 here and NaN there. A NaN that matters still comes out, because what does
-not vanish as a real function is still computed from it.
+where an operand is infinite or NaN, or both of a fraction are 0: 0 x is 0 here and NaN there. A NaN that matters
+still comes out, because what does not vanish as a real function is still computed from it.
 """
 
 from __future__ import annotations
