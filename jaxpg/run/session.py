@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -24,6 +24,15 @@ from jaxpg.types import Metrics
 RESUMABLE = ("total_steps", "log_interval", "eval_interval", "checkpoint_interval")
 
 
+class Session(NamedTuple):
+    """What a run is, how it is divided, where it is kept and where it shows."""
+
+    config: Config
+    schedule: Schedule
+    run_folder: RunFolder
+    display: Display
+
+
 def begin(config: Config) -> int:
     """Trains from the beginning; returns the exit status."""
     prepare(config)
@@ -37,8 +46,9 @@ def begin(config: Config) -> int:
         f"{algo} on {config.choices['env']}, {agents}: {run.num_envs} environments x {run.num_steps} steps x "
         f"{schedule.num_updates:,} updates = {schedule.total_steps:,} steps, into {run_folder.path}"
     )
-    program, seconds = _compile(display, config, env, schedule)
-    return _train(config, schedule, run_folder, display, program, program.init(), seconds)
+    session = Session(config, schedule, run_folder, display)
+    program, seconds = _compile(session, env)
+    return _train(session, program, program.init(), seconds)
 
 
 def resume(given: Mapping[str, Any]) -> int:
@@ -64,10 +74,11 @@ def resume(given: Mapping[str, Any]) -> int:
     for name, now in folder.versions().items():
         if recorded.get(name) != now:
             display.say(f"note: {name} was {recorded.get(name)} and is {now}: the same run, but not the same bits")
-    program, seconds = _compile(display, config, make_env(config), schedule)
+    session = Session(config, schedule, run_folder, display)
+    program, seconds = _compile(session, make_env(config))
     state = checkpoints.restore(update, program.state_shape)
     configuration.save(config, run_folder.config)
-    return _train(config, schedule, run_folder, display, program, state, seconds)
+    return _train(session, program, state, seconds)
 
 
 def _changed(run_folder: RunFolder, changes: Mapping[str, Any]) -> Config:
@@ -84,25 +95,19 @@ def _changed(run_folder: RunFolder, changes: Mapping[str, Any]) -> Config:
     return changed
 
 
-def _compile(display: Display, config: Config, env: Any, schedule: Schedule) -> tuple[Program, float]:
-    display.say("compiling ...")
+def _compile(session: Session, env: Any) -> tuple[Program, float]:
+    """The compiled program, and the seconds that it took."""
+    session.display.say("compiling ...")
     began = time.monotonic()
-    program = compile_program(config, env, schedule.chunk)
+    program = compile_program(session.config, env, session.schedule.chunk)
     seconds = time.monotonic() - began
-    display.say(f"compiled in {seconds:.1f} s")
+    session.display.say(f"compiled in {seconds:.1f} s")
     return program, seconds
 
 
-def _train(
-    config: Config,
-    schedule: Schedule,
-    run_folder: RunFolder,
-    display: Display,
-    program: Program,
-    state: RunState,
-    compile_seconds: float,
-) -> int:
+def _train(session: Session, program: Program, state: RunState, compile_seconds: float) -> int:
     """Chunk after chunk until the last update or a request to stop; returns the exit status."""
+    config, schedule, run_folder, display = session
     keeper = _Keeper(run_folder, config)
     first = update = int(state.train.update[0])
     log = MetricsLog(run_folder, update)
