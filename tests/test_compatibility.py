@@ -31,8 +31,8 @@ def test_the_installed_release_sums_right_or_is_refused():
 
 
 @pytest.mark.parametrize("environment", ["pendulum", "arm"])
-def test_the_training_program_calls_neither_lapack_nor_ynnpack(environment):
-    """Some releases of jaxlib hang in batched calls of the one, others compute wrong numbers by the other."""
+def test_the_training_program_makes_no_lapack_call(environment):
+    """Neither the start nor the updates of two agents at once: batched LAPACK calls hang on some releases."""
     sizes = ("num_seeds=2", "num_envs=8", "num_steps=2", "total_steps=32", "eval_episodes=2")
     config = compose([f"env={environment}", *sizes])
     env = make_env(config)
@@ -41,7 +41,6 @@ def test_the_training_program_calls_neither_lapack_nor_ynnpack(environment):
     with jax.debug_key_reuse(False):  # see test_vmapped_seeds_are_single_seeds
         compiled = train.lower(agent_keys(config)).compile().as_text()
     assert 'custom_call_target="lapack' not in compiled
-    assert "__ynn_fusion" not in compiled
 
 
 if __name__ == "__main__":
