@@ -69,7 +69,7 @@ TRAINING = {
     "td": {
         "num_envs": 64,
         "num_steps": 16,
-        "total_steps": 12_000_000,
+        "total_steps": 18_000_000,
         "log_interval": 100_000,
         "eval_interval": 500_000,
         "checkpoint_interval": 2_000_000,
