@@ -13,7 +13,7 @@ def blocks(language):
 
 
 def test_python_examples_run():
-    assert len(blocks("python")) == 2
+    assert len(blocks("python")) == 3
     for code in blocks("python"):
         exec(compile(code, "README.md", "exec"), {})
 
