@@ -75,6 +75,8 @@ TRAINING = {
         "checkpoint_interval": 2_000_000,
         "algo.gamma": 0.9,
         "algo.final_lr": 0.01,
+        "algo.reward_scale": 5.0,
+        "algo.normalize_advantages": False,
     },
     "reinforce": {
         "num_envs": 16,
