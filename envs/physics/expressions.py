@@ -401,8 +401,7 @@ def power(x: Scalar, y: Scalar) -> Scalar:
 def select(which: Scalar, on_false: Scalar, on_true: Scalar, *others: Scalar, dtype: np.dtype | None = None) -> Scalar:
     """`on_true` where `which` holds, else `on_false`; of more cases the one with the number `which`."""
     if others:
-        last = apply("ge", which, 1 + len(others), dtype=np.dtype(bool))
-        return select(last, select(which, on_false, on_true, *others[:-1], dtype=dtype), others[-1], dtype=dtype)
+        return choose(which, on_false, on_true, *others, dtype=dtype)
     if is_constant(which):
         return on_true if which else on_false
     if on_false is on_true or (
@@ -414,6 +413,14 @@ def select(which: Scalar, on_false: Scalar, on_true: Scalar, *others: Scalar, dt
     if _is(which, "not"):
         return select(which.args[0], on_true, on_false, dtype=dtype)
     return _new("select_n", which, on_false, on_true, dtype=dtype)
+
+
+def choose(index: Scalar, *cases: Scalar, dtype: np.dtype) -> Scalar:
+    """cases[index], the index clamped into the range."""
+    chosen = cases[0]
+    for at, case in enumerate(cases[1:], start=1):
+        chosen = select(apply("ge", index, at, dtype=np.dtype(bool)), chosen, case, dtype=dtype)
+    return chosen
 
 
 def logical_and(x: Scalar, y: Scalar) -> Scalar:

@@ -17,7 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from envs.physics.expressions import Expression, Graph
-from envs.physics.rules import RULES, UnsupportedPrimitive, as_objects, is_numeric, map_scalar, pack
+from envs.physics.rules import RULES, UnsupportedPrimitive, as_objects, choose_array, is_numeric, pack
 from envs.physics.stages import in_order, make_stages, run, separately
 
 
@@ -196,25 +196,16 @@ def _scan(operands, wanted, *, jaxpr, length, reverse, num_consts, num_carry, **
 
 
 def _cond(operands, wanted, *, branches, **_):
-    """The branch that is taken; if that depends on the data, both, and a select: what `vmap` makes of it as well."""
+    """The branch that is taken; if that depends on the data, a select among all of them, as under `vmap`."""
     which, *operands = operands
     if is_numeric(which):
         branch = branches[int(np.clip(int(which), 0, len(branches) - 1))]
         return evaluate(branch.jaxpr, branch.consts, operands, wanted)
-    results = [evaluate(branch.jaxpr, branch.consts, operands, wanted) for branch in branches]
-    chosen = results[0]
-    avals = branches[0].out_avals
-    for number, other in enumerate(results[1:], start=1):
-        reached = map_scalar("ge", as_objects(which), number, dtype=bool).item()
-        chosen = [
-            a if a is None else _select(reached, a, b, aval) for a, b, aval in zip(chosen, other, avals, strict=True)
-        ]
-    return chosen
-
-
-def _select(which, on_false, on_true, aval):
-    which = np.full(aval.shape, which, object)
-    return map_scalar("select_n", which, as_objects(on_false), as_objects(on_true), dtype=aval.dtype)
+    results = zip(*(evaluate(branch.jaxpr, branch.consts, operands, wanted) for branch in branches), strict=True)
+    return [
+        choose_array(which.item(), cases, aval) if here else None
+        for cases, aval, here in zip(results, branches[0].out_avals, wanted, strict=True)
+    ]
 
 
 def _while(operands, wanted, *, cond_nconsts, cond_jaxpr, body_nconsts, body_jaxpr):

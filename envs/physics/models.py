@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import io
-import logging
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -13,7 +12,6 @@ import numpy as np
 if TYPE_CHECKING:
     import mujoco
 
-logger = logging.getLogger(__name__)
 
 # Fields of mjModel that MJX 3.17 never reads: what they ask for is not simulated when one of them is not 0.
 IGNORED_FIELDS = {

@@ -20,7 +20,7 @@ from typing import Any
 import jax
 import numpy as np
 
-from envs.physics.expressions import NUMPY, Expression, apply, fold, snap
+from envs.physics.expressions import NUMPY, Expression, apply, choose, fold, snap
 
 Array = np.ndarray
 
@@ -85,10 +85,10 @@ def pack(elements: list, shape: tuple[int, ...]) -> Array:
     return array.reshape(shape)
 
 
-def map_scalar(name: str, x: Array, *others: Array, dtype) -> Array:
-    """An elementwise primitive applied inside another rule, to object arrays."""
-    function = functools.partial(apply, name, dtype=np.dtype(dtype))
-    return np.asarray(np.frompyfunc(function, 1 + len(others), 1)(x, *others), object)
+def choose_array(index: Expression, cases: list[Array], aval) -> Array:
+    """cases[index], the index clamped into the range."""
+    options = zip(*(as_objects(case).flat for case in cases), strict=True)
+    return pack([choose(index, *option, dtype=np.dtype(aval.dtype)) for option in options], aval.shape)
 
 
 @rule("copy", "optimization_barrier")
@@ -190,7 +190,7 @@ def _(aval, x, *start, slice_sizes):
         _window(x, np.clip([*known[:axis], at, *known[axis + 1 :]], 0, limits), slice_sizes)
         for at in range(limits[axis] + 1)
     ]
-    return _choose(index, windows, aval)
+    return choose_array(index, windows, aval)
 
 
 @rule("dynamic_update_slice")
@@ -214,16 +214,6 @@ def _traced_index(name: str, indices) -> tuple[int | None, Expression | None]:
     if len(traced) > 1:
         raise UnsupportedPrimitive(f"{name}: more than one index depends on the data")
     return traced[0] if traced else (None, None)
-
-
-def _choose(index: Expression, cases: list[Array], aval) -> Array:
-    """cases[index], the index clamped into the range, as selects."""
-    chosen = as_objects(cases[0])
-    for at, case in enumerate(cases[1:], start=1):
-        reached = apply("ge", index, at, dtype=np.dtype(bool))
-        which = np.full(chosen.shape, reached, object)
-        chosen = map_scalar("select_n", which, chosen, as_objects(case), dtype=aval.dtype)
-    return pack(list(chosen.flat), aval.shape)
 
 
 @rule("gather")
@@ -287,14 +277,7 @@ def _combiner(update_jaxpr):
     if update_jaxpr is None or not update_jaxpr.eqns:
         return lambda old, new, aval: new
     (equation,) = update_jaxpr.eqns
-    return lambda old, new, aval: RULES[equation.primitive.name](_Aval(old.shape, aval.dtype), old, new)
-
-
-class _Aval:
-    """Shape and dtype of a result inside a rule."""
-
-    def __init__(self, shape, dtype):
-        self.shape, self.dtype = shape, dtype
+    return lambda old, new, aval: RULES[equation.primitive.name](jax.ShapeDtypeStruct(old.shape, aval.dtype), old, new)
 
 
 # --- reductions -------------------------------------------------------------------------------------------------------
@@ -433,13 +416,10 @@ def _(aval, x, **_):
         lower = result[batch]
         for i, j in zip(*np.tril_indices(size), strict=True):
             rest = x[batch][i, j] - sum(lower[i, :j] * lower[j, :j])
-            lower[i, j] = _scalar("sqrt", rest, aval) if i == j else _scalar("div", rest, lower[j, j], aval)
+            lower[i, j] = (
+                apply("sqrt", rest, dtype=aval.dtype) if i == j else apply("div", rest, lower[j, j], dtype=aval.dtype)
+            )
     return result
-
-
-def _scalar(name, *operands_and_aval):
-    *operands, aval = operands_and_aval
-    return apply(name, *operands, dtype=np.dtype(aval.dtype))
 
 
 @rule("triangular_solve")
@@ -457,5 +437,5 @@ def _(aval, a, b, *, left_side, lower, transpose_a, unit_diagonal, **_):
         for i in range(size) if lower else reversed(range(size)):
             done = slice(0, i) if lower else slice(i + 1, size)
             rest = b[(*batch, i, column)] - sum(matrix[i, done] * x[done])
-            x[i] = rest if unit_diagonal else _scalar("div", rest, matrix[i, i], aval)
+            x[i] = rest if unit_diagonal else apply("div", rest, matrix[i, i], dtype=aval.dtype)
     return result if left_side else result.swapaxes(-1, -2)

@@ -46,9 +46,10 @@ class Stage:
 def make_stages(outputs: Iterable[Expression]) -> list[Stage]:
     """The stages that compute the given expressions, in order."""
     wanted = list(outputs)
-    depth = _stored_depths(in_order(wanted), {x.index for x in wanted})
+    equations = in_order(wanted)
+    depth = _stored_depths(equations, {x.index for x in wanted})
     by_depth = defaultdict(list)
-    for expression in in_order(wanted):
+    for expression in equations:
         if expression.index in depth:
             by_depth[depth[expression.index]].append(expression)
     return [_make_stage(by_depth[level], depth) for level in sorted(by_depth)]

@@ -48,8 +48,8 @@ def compile_step(
         model.dof_damping, model.opt.gravity, ...), for models that differ between the environments. All else is as
         `mjx.make_data` and the model have it.
       outputs: the fields of `mjx.Data` that the step returns, in this order, as they are after the last substep. As
-      in MuJoCo, what is derived
-        from the positions (xpos, site_xpos, sensordata, ...) belongs to the state before that substep.
+        in MuJoCo, what is derived from the positions (xpos, site_xpos, sensordata, ...) belongs to the state before
+        that substep.
       physics: "scalar": scalar equations, or `mjx.step` with a logged line that says why if the model has none;
         "mjx": `mjx.step`.
 
@@ -119,11 +119,7 @@ def _repeat(once: Callable, inputs, carried, num_substeps: int) -> Callable:
             return results[: len(carried)], results[len(carried) :]
 
         state = tuple(array for name, array in zip(inputs, arrays, strict=True) if name in carried)
-        if num_substeps == 1:
-            state, others = substep(state, None)
-            return (*state, *others)
-        state, others = jax.lax.scan(substep, state, length=num_substeps)
-        return (*state, *(other[-1] for other in others))
+        return _loop(substep, state, num_substeps)
 
     return repeated
 
@@ -143,14 +139,18 @@ def _repeat_program(program: Program, inputs, carried, num_substeps: int) -> Cal
             return tuple(results[:num_carried]), tuple(results[num_carried:])
 
         state = tuple(x for name, x in zip(names, elements, strict=True) if name in carried)
-        if num_substeps == 1:
-            state, others = substep(state, None)
-        else:
-            state, others = jax.lax.scan(substep, state, length=num_substeps)
-            others = tuple(other[-1] for other in others)
-        return tuple(program.join([*state, *others]))
+        return tuple(program.join(_loop(substep, state, num_substeps)))
 
     return repeated
+
+
+def _loop(substep: Callable, state: tuple, length: int) -> list:
+    """The last state and the last of what else a substep gives."""
+    if length == 1:
+        state, others = substep(state, None)
+        return [*state, *others]
+    state, others = jax.lax.scan(substep, state, length=length)
+    return [*state, *(other[-1] for other in others)]
 
 
 def _without_lapack(model: mujoco.MjModel) -> mujoco.MjModel:
