@@ -34,6 +34,7 @@ def with_pole(joint, shape):
 MJCF = {
     "cart-pole": chain(cart(pole()), '<motor joint="slide" gear="10"/>'),
     "double pendulum": chain(pole(pole(name="second")), '<motor joint="pole"/>'),
+    "double pendulum, no motor": chain(pole(pole(name="second"))),
     "slide joints": chain(cart(cart(name="second", axis="0.6 0.8 0")), '<motor joint="slide"/><motor joint="second"/>'),
     "ball joint": chain(
         with_pole('<joint type="ball" damping="0.3"/>', '<geom type="capsule" fromto="0 0 0 0.3 0 0.2" size="0.05"/>'),

@@ -475,7 +475,7 @@ NUMPY: dict[str, Callable[..., Any]] = {
     "add": np.add,
     "sub": np.subtract,
     "mul": np.multiply,
-    "div": lambda x, y: np.true_divide(x, y) if np.result_type(x, y).kind == "f" else np.fix(np.true_divide(x, y)),
+    "div": lambda x, y: np.true_divide(x, y) if np.result_type(x, y).kind == "f" else np.trunc(np.true_divide(x, y)),
     "rem": np.fmod,
     "neg": np.negative,
     "abs": np.abs,

@@ -68,6 +68,14 @@ class Program:
         self.stages = make_stages(x for x in self._results if isinstance(x, Expression))
         self._split = separately(_elements)
 
+    @property
+    def results(self) -> list[jax.ShapeDtypeStruct]:
+        """Shapes and dtypes of the result's leaves."""
+        return [
+            jax.ShapeDtypeStruct(array.shape, dtype)
+            for array, dtype in zip(self.outputs, self.output_dtypes, strict=True)
+        ]
+
     def __len__(self):
         """The number of scalar equations."""
         return len(in_order(x for x in self._results if isinstance(x, Expression)))
@@ -180,6 +188,13 @@ def _call(operands, wanted, *, jaxpr=None, call_jaxpr=None, **_):
     return evaluate(inner, getattr(closed, "consts", ()), operands, wanted)
 
 
+def _call_high(operands, wanted, *, _prim):
+    """A primitive that jax (from 0.12) keeps whole in its jaxprs and that knows its own definition."""
+    structure, avals = _prim.in_tree, _prim.in_avals_flat
+    closed = jax.make_jaxpr(lambda *leaves: jax.tree.leaves(_prim.expand(*structure.unflatten(leaves))))(*avals)
+    return evaluate(closed.jaxpr, closed.consts, operands, wanted)
+
+
 def _scan(operands, wanted, *, jaxpr, length, reverse, num_consts, num_carry, **_):
     consts, carry = operands[:num_consts], operands[num_consts : num_consts + num_carry]
     xs = operands[num_consts + num_carry :]
@@ -223,6 +238,7 @@ def _while(operands, wanted, *, cond_nconsts, cond_jaxpr, body_nconsts, body_jax
 
 CONTROL = {
     "jit": _call,
+    "call_hi_primitive": _call_high,
     "remat2": _call,
     "custom_jvp_call": _call,
     "custom_vjp_call": _call,

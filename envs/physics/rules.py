@@ -147,6 +147,11 @@ def _(aval, x, *, sizes, axis):
     return tuple(np.split(x, np.cumsum(sizes)[:-1], axis))
 
 
+@rule("unstack")
+def _(aval, x, *, axis):
+    return tuple(np.moveaxis(x, axis, 0))
+
+
 @rule("pad")
 def _(aval, x, value, *, padding_config):
     if any(low < 0 or high < 0 for low, high, _ in padding_config):
@@ -166,6 +171,12 @@ def _(aval, *, dimension, shape, dtype, **_):
     along = [1] * len(shape)
     along[dimension] = shape[dimension]
     return np.broadcast_to(np.arange(shape[dimension], dtype=dtype).reshape(along), shape)
+
+
+@rule("empty")
+def _(aval, **_):
+    """What nobody reads before it is written; zeros."""
+    return np.zeros(aval.shape, aval.dtype)
 
 
 def _alike(arrays):

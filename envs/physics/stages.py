@@ -31,6 +31,9 @@ COST = {"sin": 12, "cos": 12, "div": 4, "sqrt": 4, "rsqrt": 8, "pow": 20, "exp":
 # What it costs to write a value and read it again. Measured at 1,024 environments: a two-link arm is fastest at 16,
 # and a fifth slower at 8 and 32; a seven-joint arm is equally fast from 0 to 11, and a fifth slower at 16.
 STORING = 10
+# The largest loop, in additions. With arrays of 128 numbers it is below what XLA splits between threads (100,000
+# cycles by its count, for each thread), which it may not do to a loop inside a kernel (`envs.physics.tiles`).
+LARGEST = 100
 
 
 @dataclass(frozen=True)
@@ -94,7 +97,7 @@ def _stored_depths(equations: list[Expression], wanted: set[int]) -> dict[int, i
         level = max((depth[arg.index] + (arg.index in stored) for arg in below), default=0)
         depth[expression.index] = level
         cost = sum(COST.get(part.op, 1) for part in here)
-        if expression.index in wanted or (uses[expression.index] - 1) * cost > STORING:
+        if expression.index in wanted or (uses[expression.index] - 1) * cost > STORING or cost > LARGEST:
             stored[expression.index] = level
         else:
             repeated[expression.index] = here
@@ -110,12 +113,15 @@ def _make_stage(outputs: list[Expression], stored: dict[int, int]) -> Stage:
     return Stage(equations, inputs, outputs, separately(compute))
 
 
-def separately(function: Callable) -> Callable:
-    """A function of arrays that XLA compiles by itself: it is called, never inlined into its surroundings."""
+def separately(function: Callable, **marks: str) -> Callable:
+    """A function of arrays that XLA compiles by itself: it is called, never inlined into its surroundings.
+
+    `marks` are further frontend attributes of the call.
+    """
     compiled = jax.jit(function)
 
     def call(*values):
-        with set_xla_metadata(inlineable="false"):
+        with set_xla_metadata(inlineable="false", **marks):
             return compiled(*values)
 
     return call

@@ -17,6 +17,7 @@ import jax.numpy as jnp
 from envs.physics.interpreter import Program, trace
 from envs.physics.models import import_mjx, model_name, put_model
 from envs.physics.rules import UnsupportedPrimitive
+from envs.physics.tiles import in_tiles, needs_tiles
 
 if TYPE_CHECKING:
     import mujoco
@@ -70,7 +71,10 @@ def compile_step(
     once, example = single_step(model, inputs, results)
     if physics == "scalar":
         try:
-            repeated = _repeat_program(trace(once, *example), inputs, carried, num_substeps)
+            program = trace(once, *example)
+            repeated = _repeat_program(program, inputs, carried, num_substeps)
+            if needs_tiles(program):
+                repeated = in_tiles(repeated, program.results)
         except UnsupportedPrimitive as error:
             logger.warning("%s: stepped by mjx.step, not as scalar equations: %s", model_name(model), error)
             once, _ = single_step(_without_lapack(model), inputs, results)
@@ -81,7 +85,7 @@ def compile_step(
     def step(*arrays):
         if len(arrays) != len(inputs):
             raise TypeError(f"the step is a function of {', '.join(inputs)}; got {len(arrays)} arguments")
-        values = dict(zip(results, repeated(arrays), strict=True))
+        values = dict(zip(results, repeated(*map(jnp.asarray, arrays)), strict=True))
         return tuple(values[name] for name in outputs)
 
     return step
@@ -112,7 +116,7 @@ def _field(owner, name: str) -> jax.Array:
 def _repeat(once: Callable, inputs, carried, num_substeps: int) -> Callable:
     """The step with its state fed back."""
 
-    def repeated(arrays):
+    def repeated(*arrays):
         def substep(state, _):
             given = dict(zip(inputs, arrays, strict=True)) | dict(zip(carried, state, strict=True))
             results = once(*(given[name] for name in inputs))
@@ -129,8 +133,8 @@ def _repeat_program(program: Program, inputs, carried, num_substeps: int) -> Cal
     names = [name for name, array in zip(inputs, program.inputs, strict=True) for _ in array.flat]
     num_carried = sum(name in carried for name in names)
 
-    def repeated(arrays):
-        elements = program.split([jnp.asarray(array) for array in arrays])
+    def repeated(*arrays):
+        elements = program.split(arrays)
         held = [None if name in carried else x for name, x in zip(names, elements, strict=True)]
 
         def substep(state, _):
@@ -144,13 +148,13 @@ def _repeat_program(program: Program, inputs, carried, num_substeps: int) -> Cal
     return repeated
 
 
-def _loop(substep: Callable, state: tuple, length: int) -> list:
+def _loop(substep: Callable, state: tuple, length: int) -> tuple:
     """The last state and the last of what else a substep gives."""
     if length == 1:
         state, others = substep(state, None)
-        return [*state, *others]
+        return (*state, *others)
     state, others = jax.lax.scan(substep, state, length=length)
-    return [*state, *(other[-1] for other in others)]
+    return (*state, *(other[-1] for other in others))
 
 
 def _without_lapack(model: mujoco.MjModel) -> mujoco.MjModel:
