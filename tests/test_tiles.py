@@ -8,8 +8,9 @@ import models
 import numpy as np
 import pytest
 
-from envs.physics import compile_step, tiles
-from envs.physics.tiles import LANES, TILE, as_kernel, mujoco_step
+from envs.physics import compile_step, stages, tiles
+from envs.physics.stages import as_kernel
+from envs.physics.tiles import LANES, TILE, mujoco_step
 
 MODEL = models.make("double pendulum")
 
@@ -134,6 +135,13 @@ def test_derivatives(tiled, plain, transform, inside):
         return jax.vmap(transform(loss)) if inside else transform(jax.vmap(loss))
 
     agree(jax.jit(of(tiled))(*states(5)), jax.jit(of(plain))(*states(5)), 1e-5)
+
+
+def test_several_kernels(plain, monkeypatch):
+    monkeypatch.setattr(stages, "KERNEL", 40)
+    step = compile_step(MODEL)
+    agree(jax.jit(jax.vmap(step))(*states(300)), jax.jit(jax.vmap(plain))(*states(300)))
+    assert len(kernels(step, 300)) >= 3
 
 
 @pytest.mark.parametrize("constant", [False, True])

@@ -18,7 +18,7 @@ import numpy as np
 
 from envs.physics.expressions import Expression, Graph
 from envs.physics.rules import RULES, UnsupportedPrimitive, as_objects, choose_array, is_numeric, pack
-from envs.physics.stages import in_order, make_stages, run, separately
+from envs.physics.stages import Stage, in_kernels, in_order, make_stages, run, separately
 
 
 def scalarize(fn: Callable, *example_args: Any) -> Callable:
@@ -65,7 +65,7 @@ class Program:
         self.inputs, self.outputs, self.output_dtypes = inputs, outputs, output_dtypes
         self.input_structure, self.output_structure = input_structure, output_structure
         self._results = [x for array in outputs for x in as_objects(array).flat]
-        self.stages = make_stages(x for x in self._results if isinstance(x, Expression))
+        self.stages = make_stages(self._computed())
         self._split = separately(_elements)
 
     @property
@@ -78,16 +78,23 @@ class Program:
 
     def __len__(self):
         """The number of scalar equations."""
-        return len(in_order(x for x in self._results if isinstance(x, Expression)))
+        return len(in_order(self._computed()))
+
+    def kernels(self) -> list[Stage]:
+        """The stages in a few large pieces, each of them one kernel on a CPU."""
+        return in_kernels(self.stages, self._computed())
+
+    def _computed(self) -> list[Expression]:
+        return [x for x in self._results if isinstance(x, Expression)]
 
     def split(self, leaves: list) -> list[jax.Array]:
         """The elements of the arguments' leaves, in order."""
         return self._split(*leaves)
 
-    def run(self, elements: list[jax.Array]) -> list[jax.Array]:
-        """The elements of the result's leaves."""
+    def run(self, elements: list[jax.Array], stages: list[Stage] | None = None) -> list[jax.Array]:
+        """The elements of the result's leaves; by other stages than the program's own if they are given."""
         values = dict(zip((x.index for array in self.inputs for x in array.flat), elements, strict=True))
-        run(self.stages, values)
+        run(self.stages if stages is None else stages, values)
         dtypes = (dtype for array, dtype in zip(self.outputs, self.output_dtypes, strict=True) for _ in array.flat)
         return [
             values[x.index] if isinstance(x, Expression) else jnp.asarray(x, dtype)

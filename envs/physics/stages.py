@@ -34,6 +34,9 @@ STORING = 10
 # The largest loop, in additions. With arrays of 128 numbers it is below what XLA splits between threads (100,000
 # cycles by its count, for each thread), which it may not do to a loop inside a kernel (`envs.physics.tiles`).
 LARGEST = 100
+# The equations of a kernel. The compiler takes more than twice as long for twice as many, and compiles two kernels on
+# two cores at once; a seven-joint arm is a seventh slower in three kernels than in one.
+KERNEL = 3000
 
 
 @dataclass(frozen=True)
@@ -125,6 +128,55 @@ def separately(function: Callable, **marks: str) -> Callable:
             return compiled(*values)
 
     return call
+
+
+def as_kernel(function: Callable) -> Callable:
+    """A function that XLA's CPU compiler makes one kernel of, instead of one for every loop in it.
+
+    XLA does so with the small loops it finds itself, by marking their call; the mark is set here by hand. The compiler
+    aborts at a marked call with a parameter that nothing uses, and its simplifications remove uses: hence a call inside
+    the call, whose operands stay, and the barrier, which constants do not pass.
+    """
+    call = separately(separately(function), xla_cpu_small_call="true")
+
+    def kernel(*arrays):
+        return call(*lax.optimization_barrier(arrays))
+
+    return kernel
+
+
+def in_kernels(stages: list[Stage], outputs: Iterable[Expression]) -> list[Stage]:
+    """Consecutive stages joined into kernels, so large that a program has few and so small that they compile fast."""
+    groups: list[list[Stage]] = []
+    room = 0
+    for stage in stages:
+        if room < len(stage.equations):
+            groups.append([])
+            room = KERNEL
+        groups[-1].append(stage)
+        room -= len(stage.equations)
+    used = {x.index for x in outputs}
+    kernels = []
+    for group in reversed(groups):
+        kernel = _join(group, used)
+        used |= {x.index for x in kernel.inputs}
+        kernels.append(kernel)
+    return kernels[::-1]
+
+
+def _join(group: list[Stage], used: set[int]) -> Stage:
+    """Stages as one, that stores in the end what is used outside of it."""
+    computed = {x.index: x for stage in group for x in stage.outputs}
+    given = {x.index: x for stage in group for x in stage.inputs if x.index not in computed}
+    outputs = [x for index, x in computed.items() if index in used]
+
+    def compute(*values):
+        known = dict(zip(given, values, strict=True))
+        run(group, known)
+        return [known[x.index] for x in outputs]
+
+    equations = [x for stage in group for x in stage.equations]
+    return Stage(equations, list(given.values()), outputs, as_kernel(compute))
 
 
 def run(stages: list[Stage], values: dict[int, Any]) -> None:

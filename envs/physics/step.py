@@ -7,6 +7,7 @@
 from __future__ import annotations
 
 import copy
+import functools
 import logging
 from collections.abc import Callable
 from typing import TYPE_CHECKING
@@ -17,7 +18,8 @@ import jax.numpy as jnp
 from envs.physics.interpreter import Program, trace
 from envs.physics.models import import_mjx, model_name, put_model
 from envs.physics.rules import UnsupportedPrimitive
-from envs.physics.tiles import in_tiles, needs_tiles
+from envs.physics.stages import Stage
+from envs.physics.tiles import in_tiles
 
 if TYPE_CHECKING:
     import mujoco
@@ -72,9 +74,7 @@ def compile_step(
     if physics == "scalar":
         try:
             program = trace(once, *example)
-            repeated = _repeat_program(program, inputs, carried, num_substeps)
-            if needs_tiles(program):
-                repeated = in_tiles(repeated, program.results)
+            repeated = in_tiles(program, functools.partial(_repeat_program, program, inputs, carried, num_substeps))
         except UnsupportedPrimitive as error:
             logger.warning("%s: stepped by mjx.step, not as scalar equations: %s", model_name(model), error)
             once, _ = single_step(_without_lapack(model), inputs, results)
@@ -128,7 +128,7 @@ def _repeat(once: Callable, inputs, carried, num_substeps: int) -> Callable:
     return repeated
 
 
-def _repeat_program(program: Program, inputs, carried, num_substeps: int) -> Callable:
+def _repeat_program(program: Program, inputs, carried, num_substeps: int, stages: list[Stage]) -> Callable:
     """The same for scalar equations; the elements stay apart until the end."""
     names = [name for name, array in zip(inputs, program.inputs, strict=True) for _ in array.flat]
     num_carried = sum(name in carried for name in names)
@@ -139,7 +139,7 @@ def _repeat_program(program: Program, inputs, carried, num_substeps: int) -> Cal
 
         def substep(state, _):
             state = iter(state)
-            results = program.run([next(state) if x is None else x for x in held])
+            results = program.run([next(state) if x is None else x for x in held], stages)
             return tuple(results[:num_carried]), tuple(results[num_carried:])
 
         state = tuple(x for name, x in zip(names, elements, strict=True) if name in carried)

@@ -20,7 +20,7 @@ from jax.extend.core import Primitive
 from jax.interpreters import ad, batching, mlir
 
 from envs.physics.interpreter import Program
-from envs.physics.stages import separately
+from envs.physics.stages import Stage, as_kernel
 
 # Environments in a tile. Smaller, the loops are too short; from 256 on XLA splits large loops between threads, which
 # cannot be done inside a kernel.
@@ -32,43 +32,43 @@ FEW_LOOPS = 8
 LARGEST_ARRAY = 256
 
 
-def needs_tiles(program: Program) -> bool:
-    """Whether batches of the program are faster in tiles."""
-    num_loops = sum(len(stage.outputs) for stage in program.stages)
-    return num_loops > FEW_LOOPS and max(array.size for array in program.inputs + program.outputs) <= LARGEST_ARRAY
-
-
-def in_tiles(function: Callable[..., tuple], results: list[jax.ShapeDtypeStruct]) -> Callable[..., tuple]:
-    """The same function of arrays as a `mujoco_step`: a CPU computes its batch in tiles, other devices at once.
+def in_tiles(program: Program, function_of: Callable[[list[Stage]], Callable[..., tuple]]) -> Callable[..., tuple]:
+    """The function as a `mujoco_step`, whose batch a CPU computes in tiles; as it is, if it gains nothing from it.
 
     Args:
-      function: a function of arrays, made of a program's stages.
-      results: shapes and dtypes of what it returns.
+      program: what the function computes.
+      function_of: the function of arrays, made of the program's stages or of others that compute the same.
 
     Returns:
       A function that can be jitted, batched and differentiated; its derivatives are those of the plain function.
     """
-    results = tuple(results)
-    return lambda *arrays: tuple(mujoco_step.bind(*arrays, function=function, results=results, is_batched=False))
+    function = function_of(program.stages)
+    num_loops = sum(len(stage.outputs) for stage in program.stages)
+    if num_loops <= FEW_LOOPS or max(array.size for array in program.inputs + program.outputs) > LARGEST_ARRAY:
+        return function
+    kernels = program.kernels()
+    for_tiles = as_kernel(function) if len(kernels) == 1 else function_of(kernels)
+    functions = {"function": function, "for_tiles": for_tiles, "results": tuple(program.results)}
+    return lambda *arrays: tuple(mujoco_step.bind(*arrays, **functions, is_batched=False))
 
 
 mujoco_step = Primitive("mujoco_step")
 mujoco_step.multiple_results = True
 
 
-def _plain(*arrays, function, results, is_batched):
+def _plain(*arrays, function, is_batched, **_):
     return (jax.vmap(function) if is_batched else function)(*arrays)
 
 
-def _tiled(*arrays, function, results, is_batched):
+def _tiled(*arrays, function, for_tiles, is_batched, **_):
     """Tile by tile; the last tile is filled up with copies of the last environment."""
     if not is_batched:
         return function(*arrays)
-    kernel = as_kernel(jax.vmap(function))
+    tile = jax.vmap(for_tiles)
     size = len(arrays[0])
     num_tiles = -(-size // TILE)
     if num_tiles == 1:
-        return kernel(*arrays)
+        return tile(*arrays)
     length = -(-size // (num_tiles * LANES)) * LANES
     padding = num_tiles * length - size
 
@@ -77,26 +77,11 @@ def _tiled(*arrays, function, results, is_batched):
             x = jnp.concatenate([x, jnp.broadcast_to(x[-1], (padding, *x.shape[1:]))])
         return x.reshape(num_tiles, length, *x.shape[1:])
 
-    found = lax.map(lambda tile: kernel(*tile), tuple(map(cut, arrays)))
+    found = lax.map(lambda given: tile(*given), tuple(map(cut, arrays)))
     return tuple(x.reshape(-1, *x.shape[2:])[:size] for x in found)
 
 
-def as_kernel(function: Callable) -> Callable:
-    """A function that XLA's CPU compiler makes one kernel of, instead of one for every loop in it.
-
-    XLA does so with the small loops it finds itself, by marking their call; the mark is set here by hand. The compiler
-    aborts at a marked call with a parameter that nothing uses, and its simplifications remove uses: hence a call inside
-    the call, whose operands stay, and the barrier, which constants do not pass.
-    """
-    call = separately(separately(function), xla_cpu_small_call="true")
-
-    def kernel(*arrays):
-        return call(*lax.optimization_barrier(arrays))
-
-    return kernel
-
-
-def _shapes(*arrays, function, results, is_batched):
+def _shapes(*arrays, results, is_batched, **_):
     batch = arrays[0].shape[:1] if is_batched else ()
     return [jax.core.ShapedArray((*batch, *x.shape), x.dtype) for x in results]
 
@@ -122,7 +107,7 @@ def _derivative(primals, tangents, **params):
     return jax.jvp(lambda *arrays: list(_plain(*arrays, **params)), tuple(primals), tangents)
 
 
-mujoco_step.def_impl(jax.jit(mujoco_step.bind, static_argnames=("function", "results", "is_batched")))
+mujoco_step.def_impl(jax.jit(mujoco_step.bind, static_argnames=("function", "for_tiles", "results", "is_batched")))
 mujoco_step.def_abstract_eval(_shapes)
 mlir.register_lowering(mujoco_step, mlir.lower_fun(_plain, multiple_results=True))
 mlir.register_lowering(mujoco_step, mlir.lower_fun(_tiled, multiple_results=True), platform="cpu")
