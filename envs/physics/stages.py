@@ -31,9 +31,10 @@ COST = {"sin": 12, "cos": 12, "div": 4, "sqrt": 4, "rsqrt": 8, "pow": 20, "exp":
 # What it costs to write a value and read it again. Measured at 1,024 environments: a two-link arm is fastest at 16,
 # and a fifth slower at 8 and 32; a seven-joint arm is equally fast from 0 to 11, and a fifth slower at 16.
 STORING = 10
-# The largest loop, in additions. With arrays of 128 numbers it is below what XLA splits between threads (100,000
-# cycles by its count, for each thread), which it may not do to a loop inside a kernel (`envs.physics.tiles`).
-LARGEST = 100
+# A value that costs more is stored, however few use it. A loop inside a kernel may not be so large that XLA splits it
+# between threads (`envs.physics.tiles`): one that joins two such values has less than a hundred additions, and XLA
+# begins to split arrays of 128 numbers at about 150.
+LARGEST = 48
 # The equations of a kernel. The compiler takes more than twice as long for twice as many, and compiles two kernels on
 # two cores at once; a seven-joint arm is a seventh slower in three kernels than in one.
 KERNEL = 3000
