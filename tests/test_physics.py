@@ -237,6 +237,19 @@ def test_dense_matrices_by_mjx_call_lapack():
     assert calls_lapack(compile_step(model, physics="mjx"), model)
 
 
+@pytest.mark.study
+@pytest.mark.parametrize("num_envs", [1_024, 16_384])
+@pytest.mark.parametrize("name", ["pendulum", "arm, torque", "panda"])
+def test_a_thousand_calls_end(name, num_envs):
+    """Some jaxlib releases hang after some hundred calls of programs with LAPACK or YNNPACK in them."""
+    model = models.make(name)
+    qpos, qvel, ctrl = in_float32(models.random_states(model, num_envs))
+    step = jax.jit(jax.vmap(compile_step(model)))
+    for _ in range(1_000):
+        qpos, qvel = step(qpos, qvel, 0.01 * ctrl)
+    assert np.isfinite(qvel).all()
+
+
 def test_environments_have_both_physics():
     """`env.physics=mjx` takes the same step."""
     state = envs.make("arm").reset(jax.random.key(0))
