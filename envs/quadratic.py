@@ -1,0 +1,213 @@
+"""A linear-quadratic problem, on which everything about a linear-Gaussian policy is known in closed form.
+
+    s_{t+1} = A s_t + B a_t + w_t,    w_t ~ N(0, W),    s_0 ~ N(m_0, S_0)
+    r_t     = -(s_{t+1}' Q s_{t+1} + a_t' R a_t)
+    a_t     ~ N(K s_t + k, sigma^2 I)
+
+for T steps, with discount gamma. Under the policy the value is quadratic in the state, V_t(s) = -(s' P_t s + 2 p_t' s +
+c_t), and comes from a recursion backwards in time; the states are Gaussian, and their moments come from a recursion
+forwards. Both together give J and its gradient. All of this is plain numpy in float64: it is what estimators are tested
+against.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+
+
+@dataclass(frozen=True)
+class Problem:
+    """A linear-quadratic problem with n state and m action variables.
+
+    Attributes:
+      A, B: dynamics, `[n, n]` and `[n, m]`.
+      Q, R: costs of the next state and of the action, symmetric, `[n, n]` and `[m, m]`; R positive definite.
+      W: covariance of the noise on the state, `[n, n]`.
+      initial_mean, initial_covariance: of s_0, `[n]` and `[n, n]`.
+      horizon: T.
+      discount: gamma, in [0, 1].
+    """
+
+    A: np.ndarray
+    B: np.ndarray
+    Q: np.ndarray
+    R: np.ndarray
+    W: np.ndarray
+    initial_mean: np.ndarray
+    initial_covariance: np.ndarray
+    horizon: int
+    discount: float
+
+
+class Policy(NamedTuple):
+    """a ~ N(K s + k, sigma^2 I): `K` `[m, n]`, `k` `[m]`, `sigma` a number."""
+
+    K: np.ndarray
+    k: np.ndarray
+    sigma: float
+
+
+class Quadratic(NamedTuple):
+    """x -> -(x' P x + 2 p' x + c), with P symmetric."""
+
+    P: np.ndarray
+    p: np.ndarray
+    c: float
+
+    def __call__(self, x: np.ndarray) -> np.ndarray:
+        """The value at `[..., n]`, `[...]`."""
+        return -(np.einsum("...i,ij,...j", x, self.P, x) + 2 * x @ self.p + self.c)
+
+
+def toy(horizon: int = 50, discount: float = 0.99) -> Problem:
+    """The lesson's example, section 8.3: s' = s + 0.1 a, r = -(s'^2 + 0.01 a^2), from s_0 = 0.5."""
+    return Problem(
+        A=np.eye(1),
+        B=np.array([[0.1]]),
+        Q=np.eye(1),
+        R=np.array([[0.01]]),
+        W=np.zeros((1, 1)),
+        initial_mean=np.array([0.5]),
+        initial_covariance=np.zeros((1, 1)),
+        horizon=horizon,
+        discount=discount,
+    )
+
+
+def values(problem: Problem, policy: Policy) -> list[Quadratic]:
+    """V_t(s) for t = 0 ... T, each a `Quadratic` of s; V_T = 0, V_t = `backup` of V_{t+1}."""
+    found = [zero(problem)]
+    for _ in range(problem.horizon):
+        found.append(backup(problem, policy, found[-1]))
+    return found[::-1]
+
+
+def zero(problem: Problem) -> Quadratic:
+    """The value of every state when no reward is to come."""
+    return Quadratic(np.zeros_like(problem.A), np.zeros(len(problem.A)), 0.0)
+
+
+def backup(problem: Problem, policy: Policy, following: Quadratic) -> Quadratic:
+    """s -> E[r_t + gamma following(s_{t+1}) | s_t = s] under the policy.
+
+    With F = A + B K, following = -(s' P s + 2 p' s + c), M = Q + gamma P, m = gamma p, H = B' M B + R, the result has
+
+        F' M F + K' R K,    F' (M B k + m) + K' R k,    k' H k + 2 m' B k + tr(M W) + sigma^2 tr(H) + gamma c
+    """
+    B, R = problem.B, problem.R
+    K, k, sigma = policy
+    F = problem.A + B @ K
+    M, m, c = _cost_to_go(problem, following)
+    H = B.T @ M @ B + R
+    return Quadratic(
+        F.T @ M @ F + K.T @ R @ K,
+        F.T @ (M @ B @ k + m) + K.T @ R @ k,
+        k @ H @ k + 2 * m @ B @ k + sigma**2 * np.trace(H) + c,
+    )
+
+
+def action_value(problem: Problem, following: Quadratic) -> Quadratic:
+    """(s, a) -> E[r_t + gamma following(s_{t+1}) | s_t = s, a_t = a], of the vector that joins s and a.
+
+    Q_t is that of V_{t+1}.
+    """
+    both = np.concatenate([problem.A, problem.B], axis=1)
+    M, m, c = _cost_to_go(problem, following)
+    P = both.T @ M @ both
+    P[-len(problem.R) :, -len(problem.R) :] += problem.R
+    return Quadratic(P, both.T @ m, c)
+
+
+def _cost_to_go(problem: Problem, following: Quadratic) -> Quadratic:
+    """The cost of x = A s + B a: of x and of what follows, the noise averaged."""
+    M = problem.Q + problem.discount * following.P
+    return Quadratic(M, problem.discount * following.p, np.trace(M @ problem.W) + problem.discount * following.c)
+
+
+def lambda_targets(problem: Problem, policy: Policy, critic: list[Quadratic], lambda_: float) -> list[Quadratic]:
+    """What TD(lambda) bootstraps from at s_{t+1}, on average, for t = 0 ... T - 1.
+
+        following_t = (1 - lambda) critic_{t+1} + lambda E[G^lambda_{t+1} | s_{t+1}]
+
+    lambda = 0 is the critic itself, lambda = 1 the policy's own value, whatever the critic says.
+
+    Args:
+      problem, policy: as above.
+      critic: T + 1 values that somebody believes in, exact or not; the last one is of states in which all is over.
+      lambda_: in [0, 1].
+    """
+    target, found = critic[-1], []
+    for believed in critic[:0:-1]:
+        found.append(Quadratic(*((1 - lambda_) * x + lambda_ * y for x, y in zip(believed, target, strict=True))))
+        target = backup(problem, policy, found[-1])
+    return found[::-1]
+
+
+def objective(problem: Problem, policy: Policy) -> float:
+    """J = E[sum_t gamma^t r_t] = E[V_0(s_0)]."""
+    value = values(problem, policy)[0]
+    return float(value(problem.initial_mean) - np.trace(value.P @ problem.initial_covariance))
+
+
+def state_moments(problem: Problem, policy: Policy) -> list[tuple[np.ndarray, np.ndarray]]:
+    """(E[s_t], E[s_t s_t']) for t = 0 ... T - 1 under the policy."""
+    A, B = problem.A, problem.B
+    F, drift = A + B @ policy.K, B @ policy.k
+    noise = policy.sigma**2 * B @ B.T + problem.W
+    mean, covariance = problem.initial_mean, problem.initial_covariance
+    found = []
+    for _ in range(problem.horizon):
+        found.append((mean, covariance + np.outer(mean, mean)))
+        mean, covariance = F @ mean + drift, F @ covariance @ F.T + noise
+    return found
+
+
+def gradient(
+    problem: Problem, policy: Policy, following: list[Quadratic] | None = None, discounted: bool = True
+) -> Policy:
+    """The gradient of J with respect to K, k and log sigma (in the place of sigma), by the policy-gradient theorem.
+
+        dJ/dK         = sum_t gamma^t E[g_t(s_t) s_t'],    g_t(s) = -2 (H_t (K s + k) + B' (M_t A s + m_t))
+        dJ/dk         = sum_t gamma^t E[g_t(s_t)]
+        dJ/dlog sigma = -2 sigma^2 sum_t gamma^t tr(H_t)
+
+    where g_t(s) = E[grad_a Q_t(s, a)], and H_t, M_t, m_t are as in `backup`.
+
+    Args:
+      problem, policy: as above.
+      following: T quadratics in the place of V_{t+1}: those of `lambda_targets` give the mean of the gradient that
+        TD(lambda) estimates with a critic that is wrong. None: the policy's own values.
+      discounted: without it the factors gamma^t are left out, as in the lesson's section 3 and in most programs. That
+        sum is the mean of the estimators that leave them out; it is not the gradient of J.
+    """
+    A, B, R = problem.A, problem.B, problem.R
+    K, k, sigma = policy
+    dK, dk, dlog_sigma = np.zeros_like(K), np.zeros_like(k), 0.0
+    following = values(problem, policy)[1:] if following is None else following
+    for t, (mean, second) in enumerate(state_moments(problem, policy)):
+        M, m, _ = _cost_to_go(problem, following[t])
+        H = B.T @ M @ B + R
+        slope, offset = H @ K + B.T @ M @ A, H @ k + B.T @ m
+        factor = -2 * (problem.discount**t if discounted else 1.0)
+        dK = dK + factor * (slope @ second + np.outer(offset, mean))
+        dk = dk + factor * (slope @ mean + offset)
+        dlog_sigma = dlog_sigma + factor * sigma**2 * np.trace(H)
+    return Policy(dK, dk, float(dlog_sigma))
+
+
+def riccati_gains(problem: Problem) -> list[np.ndarray]:
+    """The optimal K_t for t = 0 ... T - 1: the policy that nothing beats, deterministic and different at each step.
+
+    K_t = -(B' M_t B + R)^-1 B' M_t A,    M_t = Q + gamma P_{t+1},    P_t = A' M_t (A + B K_t),    P_T = 0
+    """
+    A, B = problem.A, problem.B
+    P = np.zeros_like(A)
+    gains = []
+    for _ in range(problem.horizon):
+        M = problem.Q + problem.discount * P
+        gains.append(-np.linalg.solve(B.T @ M @ B + problem.R, B.T @ M @ A))
+        P = A.T @ M @ (A + B @ gains[-1])
+    return gains[::-1]

@@ -1,0 +1,175 @@
+"""The linear-quadratic problem's closed forms are those of its definition."""
+
+import jax
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from envs.quadratic import (
+    Policy,
+    Problem,
+    action_value,
+    gradient,
+    lambda_targets,
+    objective,
+    riccati_gains,
+    state_moments,
+    toy,
+    values,
+)
+
+
+def random_problem(seed, n, m, horizon=6, discount=0.9):
+    random = np.random.default_rng(seed)
+
+    def covariance(size):
+        root = random.normal(size=(size, size))
+        return root @ root.T / size
+
+    return Problem(
+        A=random.normal(size=(n, n)) / np.sqrt(n),
+        B=random.normal(size=(n, m)),
+        Q=covariance(n),
+        R=covariance(m) + 0.1 * np.eye(m),
+        W=0.1 * covariance(n),
+        initial_mean=random.normal(size=n),
+        initial_covariance=covariance(n),
+        horizon=horizon,
+        discount=discount,
+    )
+
+
+def random_policy(seed, problem):
+    random = np.random.default_rng(seed + 1)
+    n, m = problem.B.shape
+    return Policy(0.3 * random.normal(size=(m, n)), random.normal(size=m), 0.4)
+
+
+problems = st.builds(
+    random_problem,
+    st.integers(0, 1000),
+    st.integers(1, 3),
+    st.integers(1, 2),
+    st.integers(1, 8),
+    st.sampled_from([0.0, 0.9, 1.0]),
+)
+
+
+@given(problems, st.integers(0, 1000))
+@settings(max_examples=50, deadline=None)
+def test_objective_is_the_sum_of_the_expected_rewards(problem, seed):
+    """E[x' Q x] = tr(Q E[x x']) at every step, forwards in time; the objective comes from the backward recursion."""
+    policy = random_policy(seed, problem)
+    K, k, sigma = policy
+    moments = [*state_moments(problem, policy)]
+    total = 0.0
+    for t, (mean, second) in enumerate(moments):
+        action = K @ second @ K.T + np.outer(K @ mean, k) + np.outer(k, K @ mean) + np.outer(k, k)
+        action = action + sigma**2 * np.eye(len(k))
+        both = np.block([[second, second @ K.T + np.outer(mean, k)], [K @ second + np.outer(k, mean), action]])
+        step = np.concatenate([problem.A, problem.B], axis=1)
+        following = step @ both @ step.T + problem.W
+        total -= problem.discount**t * (np.trace(problem.Q @ following) + np.trace(problem.R @ action))
+    np.testing.assert_allclose(objective(problem, policy), total, rtol=1e-9)
+
+
+@given(problems, st.integers(0, 1000))
+@settings(max_examples=50, deadline=None)
+def test_gradient_is_the_objectives_slope(problem, seed):
+    """Central differences; J is quadratic in k and sigma, and a polynomial in K."""
+    policy = random_policy(seed, problem)
+    exact = gradient(problem, policy)
+    epsilon = 1e-5
+
+    def slope(change):
+        plus, minus = (objective(problem, change(sign * epsilon)) for sign in (1, -1))
+        return (plus - minus) / (2 * epsilon)
+
+    def at(array, place, by):
+        changed = array.copy()
+        changed[place] += by
+        return changed
+
+    size = max(np.abs(x).max() for x in exact)
+    for place in np.ndindex(policy.K.shape):
+        found = slope(lambda by, place=place: policy._replace(K=at(policy.K, place, by)))
+        np.testing.assert_allclose(exact.K[place], found, rtol=1e-5, atol=1e-6 * size)
+    for place in np.ndindex(policy.k.shape):
+        found = slope(lambda by, place=place: policy._replace(k=at(policy.k, place, by)))
+        np.testing.assert_allclose(exact.k[place], found, rtol=1e-5, atol=1e-6 * size)
+    found = slope(lambda by: policy._replace(sigma=policy.sigma * np.exp(by)))
+    np.testing.assert_allclose(exact.sigma, found, rtol=1e-5, atol=1e-6 * size)
+
+
+@given(problems, st.integers(0, 1000))
+@settings(max_examples=20, deadline=None)
+def test_bellmans_equations(problem, seed):
+    """V_t(s) = E_a Q_t(s, a), and Q_t(s, a) = E[r + gamma V_{t+1}(s')], the noise integrated by sigma points."""
+    policy = random_policy(seed, problem)
+    n, m = problem.B.shape
+    random = np.random.default_rng(seed)
+    s, a = random.normal(size=n), random.normal(size=m)
+    value = values(problem, policy)
+    of_action = [action_value(problem, following) for following in value[1:]]
+    root = np.linalg.cholesky(problem.W + 1e-300 * np.eye(n))
+    for t in range(problem.horizon):
+        # 2 n points at +- sqrt(n) columns of the root have the noise's mean and covariance: exact for quadratics.
+        expected = 0.0
+        for noise in np.concatenate([root.T, -root.T]) * np.sqrt(n):
+            following = problem.A @ s + problem.B @ a + noise
+            reward = -(following @ problem.Q @ following + a @ problem.R @ a)
+            expected += (reward + problem.discount * value[t + 1](following)) / (2 * n)
+        np.testing.assert_allclose(of_action[t](np.concatenate([s, a])), expected, rtol=1e-9)
+        mean = policy.K @ s + policy.k
+        points = [mean + sign * np.sqrt(m) * policy.sigma * column for column in np.eye(m) for sign in (1, -1)]
+        averaged = np.mean([of_action[t](np.concatenate([s, point])) for point in points])
+        np.testing.assert_allclose(value[t](s), averaged, rtol=1e-9)
+
+
+def test_riccati_gains_are_the_best():
+    """Backwards in time, each gain is where the slope of Q_t with respect to the action vanishes, at every state."""
+    problem = random_problem(5, 3, 2)
+    n = len(problem.A)
+    gains = riccati_gains(problem)
+    P = np.zeros((n, n))
+    for K in gains[::-1]:
+        M = problem.Q + problem.discount * P
+        both = np.concatenate([problem.A, problem.B], axis=1)
+        hessian = both.T @ M @ both
+        hessian[n:, n:] += problem.R
+        np.testing.assert_allclose(hessian[n:, :n] + hessian[n:, n:] @ K, 0, atol=1e-12)
+        closed = np.concatenate([np.eye(n), K])
+        P = closed.T @ hessian @ closed
+    optimum = -(problem.initial_mean @ P @ problem.initial_mean + np.trace(P @ problem.initial_covariance))
+    noise = Policy(gains[0], np.zeros(2), 0.0)
+    assert objective(Problem(**{**vars(problem), "W": np.zeros((n, n))}), noise) <= optimum
+
+
+def test_the_lessons_example():
+    """Without control the state stays at 0.5 and each step costs 0.25, besides the exploration's cost."""
+    idle = Policy(np.zeros((1, 1)), np.zeros(1), 0.0)
+    np.testing.assert_allclose(objective(toy(horizon=50, discount=1.0), idle), -50 * 0.25)
+    gains = [K.item() for K in riccati_gains(toy())]
+    assert -10 < min(gains) < max(gains) < 0
+    assert gains[-1] == pytest.approx(-0.1 / (0.1**2 + 0.01))
+
+
+def test_gradient_without_discount_factors_is_not_the_gradient():
+    problem = random_problem(1, 2, 1)
+    policy = random_policy(1, problem)
+    true, without = gradient(problem, policy), gradient(problem, policy, discounted=False)
+    assert np.abs(true.K - without.K).max() > 0.01
+    jax.tree.map(
+        np.testing.assert_array_equal,
+        *(gradient(Problem(**{**vars(problem), "discount": 1.0}), policy, discounted=flag) for flag in (True, False)),
+    )
+
+
+def test_lambda_goes_from_the_critic_to_the_truth():
+    problem = random_problem(2, 2, 1)
+    policy = random_policy(2, problem)
+    critic = values(problem, random_policy(9, problem))
+    for lambda_, expected in ((0.0, critic), (1.0, values(problem, policy))):
+        for mine, true in zip(lambda_targets(problem, policy, critic, lambda_), expected[1:], strict=True):
+            jax.tree.map(np.testing.assert_allclose, tuple(mine), tuple(true))
