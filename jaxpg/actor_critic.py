@@ -13,11 +13,12 @@ import jax
 import jax.numpy as jnp
 import optax
 
-from jaxpg import estimators, normalization
+from jaxpg import baselines, estimators, normalization
 from jaxpg.distributions import gaussian_entropy, gaussian_sample, squashed_gaussian_log_prob
 from jaxpg.estimators import Estimate
 from jaxpg.losses import entropy_loss, policy_gradient_loss, value_loss
 from jaxpg.networks import Networks
+from jaxpg.returns import discounted_returns
 from jaxpg.rollout import PolicyFn, rollout
 from jaxpg.types import Algorithm, Metrics, PyTree, TrainState, Transition
 from jaxpg.vector_env import VectorEnv, VectorState, stagger
@@ -30,13 +31,14 @@ class Method(NamedTuple):
       start: `start(env, key) -> env_state`, the environments before the first update.
       collect: `collect(env, policy_fn, env_state, key) -> (env_state, Transition)`.
       weight: `weight(transition) -> [T, N]`, 1 where a step counts.
-      estimate: `estimate(transition, weight, value, next_value) -> Estimate`, all `[T, N]`.
+      estimate: `estimate(transition, weight, value, next_value, squared_score) -> Estimate`, all `[T, N]`; the score is
+        the gradient of log pi(a_t | s_t) in the Gaussian's mean.
     """
 
     start: Callable[[VectorEnv, jax.Array], VectorState]
     collect: Callable[[VectorEnv, PolicyFn, VectorState, jax.Array], tuple[VectorState, Transition]]
     weight: Callable[[Transition], jax.Array]
-    estimate: Callable[[Transition, jax.Array, jax.Array, jax.Array], Estimate]
+    estimate: Callable[[Transition, jax.Array, jax.Array, jax.Array, jax.Array], Estimate]
 
 
 def td(gamma: float, lambda_: float, num_steps: int) -> Method:
@@ -58,7 +60,7 @@ def td(gamma: float, lambda_: float, num_steps: int) -> Method:
     def collect(env, policy_fn, env_state, key):
         return rollout(policy_fn, env.step, env_state, key, num_steps)
 
-    def estimate(transition, weight, value, next_value):
+    def estimate(transition, weight, value, next_value, squared_score):
         discount = gamma * (1 - transition.terminated)
         continues = 1 - transition.truncated
         return estimators.td_lambda(transition.reward, discount, value, next_value, lambda_ * continues)
@@ -66,7 +68,7 @@ def td(gamma: float, lambda_: float, num_steps: int) -> Method:
     return Method(start, collect, lambda transition: jnp.ones_like(transition.reward), estimate)
 
 
-BASELINES = ("none", "mean", "value")
+BASELINES = ("none", "mean", "time_mean", "leave_one_out", "optimal", "value")
 
 
 def reinforce(gamma: float, baseline: str) -> Method:
@@ -86,14 +88,19 @@ def reinforce(gamma: float, baseline: str) -> Method:
         ended = jnp.cumsum(transition.terminated, axis=0) - transition.terminated
         return (ended == 0).astype(transition.reward.dtype)
 
-    def estimate(transition, weight, value, next_value):
+    def estimate(transition, weight, value, next_value, squared_score):
         reward = weight * transition.reward
         discount = gamma * (1 - transition.terminated)
-        if baseline == "none":
-            return estimators.reinforce(reward, discount)
-        if baseline == "mean":
-            return estimators.reinforce_mean_baseline(reward, discount, weight)
-        return estimators.reinforce_value_baseline(reward, discount, value)
+        returns = discounted_returns(reward, discount, 0.0)
+        subtracted = {
+            "none": lambda: 0.0,
+            "mean": lambda: baselines.batch_mean(returns, weight),
+            "time_mean": lambda: baselines.time_mean(returns, weight),
+            "leave_one_out": lambda: baselines.leave_one_out(returns, weight),
+            "optimal": lambda: baselines.optimal(returns, squared_score, weight),
+            "value": lambda: value,
+        }[baseline]()
+        return estimators.reinforce(reward, discount, subtracted)
 
     return Method(lambda env, key: env.reset(key), collect, weight, estimate)
 
@@ -147,10 +154,12 @@ def actor_critic(
         next_value = networks.value(jax.lax.stop_gradient(params["critic"]), next_obs)
         weight = method.weight(transition)
         scaled = transition._replace(reward=reward_scale * transition.reward)
-        advantage, target = method.estimate(scaled, weight, value, next_value)
+        mean, log_std = networks.policy(params["actor"], obs)
+        score = jax.lax.stop_gradient((transition.pre_tanh - mean) * jnp.exp(-2 * log_std))
+        squared_score = jnp.sum(jnp.square(score), axis=-1)
+        advantage, target = method.estimate(scaled, weight, value, next_value, squared_score)
         if normalize_advantages:
             advantage = estimators.normalize_advantages(advantage, weight)
-        mean, log_std = networks.policy(params["actor"], obs)
         log_prob = squashed_gaussian_log_prob(transition.pre_tanh, mean, log_std)
         entropy = jnp.broadcast_to(gaussian_entropy(log_std), weight.shape)
         losses = {

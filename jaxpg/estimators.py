@@ -4,16 +4,19 @@ All estimate the same gradient, by the same sum with a different advantage:
 
     grad J(theta) ~ mean over trajectories of  sum_t  grad log pi_theta(a_t | s_t)  A_t
 
-| function                  | A_t                              | bias        | variance | target of the critic |
-|---------------------------|----------------------------------|-------------|----------|----------------------|
-| `reinforce`               | G_t                              | none        | highest  | G_t                  |
-| `reinforce_mean_baseline` | G_t - mean G                     | factor 1-1/N| lower    | G_t                  |
-| `reinforce_value_baseline`| G_t - V(s_t)                     | none        | lower    | G_t                  |
-| `td_lambda`               | G_t^lambda - V(s_t)  (GAE)       | critic's    | between  | G_t^lambda           |
-| `td_zero`                 | r_t + gamma V(s_{t+1}) - V(s_t)  | the critic's| lowest   | A_t + V(s_t)         |
+| function          | A_t                              | bias                | variance                    |
+|-------------------|----------------------------------|---------------------|-----------------------------|
+| `reinforce_whole` | R(tau) - b                       | the baseline's      | highest                     |
+| `reinforce`       | G_t - b_t                        | the baseline's      | high; less with a good b_t  |
+| `n_step`          | G^(n)_t - V(s_t)                 | gamma^n the critic's| grows with n                |
+| `td_lambda` (GAE) | G_t^lambda - V(s_t)              | between             | grows with lambda           |
+| `td_zero`         | r_t + gamma V(s_{t+1}) - V(s_t)  | the critic's        | lowest                      |
 
-"None" is with respect to the gradient that leaves out the factor gamma^t, as the lesson's section 3 does; it is the
-gradient of J itself at gamma = 1. Arrays have time first, `[T, ...]`; discounts are as in `jaxpg.returns`.
+`jaxpg.baselines` has the baselines b_t with their own table. REINFORCE needs complete episodes, the others bootstrap
+from the critic where a trajectory is cut. The critic of REINFORCE learns G_t, that of the others A_t + V(s_t).
+
+Bias is with respect to the gradient that leaves out the factor gamma^t, as the lesson's section 3 does; times
+`jaxpg.returns.discount_factors` all of them estimate grad J itself. `reinforce_whole` does so as it is.
 """
 
 from __future__ import annotations
@@ -23,7 +26,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
-from jaxpg.returns import discounted_returns, lambda_returns, td_errors
+from jaxpg.returns import discounted_returns, lambda_returns, n_step_returns, td_errors, whole_returns
 from jaxpg.shapes import floating, same, spread
 
 
@@ -39,74 +42,51 @@ class Estimate(NamedTuple):
     target: jax.Array
 
 
-def reinforce(reward: jax.Array, discount: jax.Array | float) -> Estimate:
-    """REINFORCE without a baseline, from complete episodes.
+def reinforce(reward: jax.Array, discount: jax.Array | float, baseline: jax.Array | float = 0.0) -> Estimate:
+    """REINFORCE: the return, from complete episodes, less a baseline.
 
-        A_t = G_t = r_t + d_t G_{t+1},    G_T = 0
+        A_t = G_t - b_t,    G_t = r_t + d_t G_{t+1},    G_T = 0
 
-    Args:
-      reward: r_t, `[T, ...]`, 0 after the end of an episode.
-      discount: d_t, `[T, ...]` or a scalar.
-
-    Raises:
-      ValueError: an array's shape does not fit the rewards'.
-
-    Source: the lesson, section 3; Williams, Machine Learning 8 (1992).
-
-    >>> reinforce(jnp.array([1.0, 2.0]), 1.0).advantage.tolist()
-    [3.0, 2.0]
-    """
-    returns = discounted_returns(reward, discount, 0.0)
-    return Estimate(returns, returns)
-
-
-def reinforce_mean_baseline(
-    reward: jax.Array, discount: jax.Array | float, weight: jax.Array | float = 1.0
-) -> Estimate:
-    """REINFORCE with the mean return of the batch as baseline.
-
-        A_t = G_t - b,    b = sum_{t,i} w_{t,i} G_{t,i} / sum_{t,i} w_{t,i}
-
-    The mean contains the sample itself, which shrinks the expected gradient by about 1 - 1/N for N trajectories.
+    With b_t = V(s_t) it is Monte Carlo minus value.
 
     Args:
       reward: r_t, `[T, ...]`, 0 after the end of an episode.
       discount: d_t, `[T, ...]` or a scalar.
-      weight: 1 where the step belongs to the episode and 0 after its end, `[T, ...]` or a scalar.
+      baseline: b_t, `[T, ...]` or a scalar; it may depend on s_t, not on a_t (`jaxpg.baselines`).
 
     Raises:
       ValueError: an array's shape does not fit the rewards'.
 
-    Source: the lesson, section 3.1 (a baseline that is the same for every state).
+    Source: the lesson, sections 3 and 3.1; Williams, Machine Learning 8 (1992).
 
-    >>> reinforce_mean_baseline(jnp.array([1.0, 2.0]), 1.0).advantage.tolist()
-    [0.5, -0.5]
-    """
-    returns = discounted_returns(reward, discount, 0.0)
-    weight = spread(weight, returns, "weight")
-    return Estimate(returns - jnp.sum(weight * returns) / jnp.sum(weight), returns)
-
-
-def reinforce_value_baseline(reward: jax.Array, discount: jax.Array | float, value: jax.Array) -> Estimate:
-    """REINFORCE with a learned value function as baseline: Monte Carlo minus value.
-
-        A_t = G_t - V(s_t)
-
-    Args:
-      reward: r_t, `[T, ...]`, 0 after the end of an episode.
-      discount: d_t, `[T, ...]` or a scalar.
-      value: V(s_t), `[T, ...]`.
-
-    Raises:
-      ValueError: an array's shape does not fit the rewards'.
-
-    Source: the lesson, section 3.1.
-
-    >>> reinforce_value_baseline(jnp.array([1.0, 2.0]), 1.0, jnp.array([2.0, 2.0])).advantage.tolist()
+    >>> reinforce(jnp.array([1.0, 2.0]), 1.0, jnp.array([2.0, 2.0])).advantage.tolist()
     [1.0, 0.0]
     """
     returns = discounted_returns(reward, discount, 0.0)
-    return Estimate(returns - same(value, returns, "value"), returns)
+    return Estimate(returns - spread(baseline, returns, "baseline"), returns)
+
+
+def reinforce_whole(reward: jax.Array, discount: jax.Array | float, baseline: jax.Array | float = 0.0) -> Estimate:
+    """REINFORCE with the return of the whole trajectory, as the theorem is first derived.
+
+        A_t = R(tau) - b,    R(tau) = sum_k d_0 ... d_{k-1} r_k
+
+    Args:
+      reward: r_t, `[T, ...]`, 0 after the end of an episode.
+      discount: d_t, `[T, ...]` or a scalar.
+      baseline: b, `[T, ...]` or a scalar.
+
+    Raises:
+      ValueError: an array's shape does not fit the rewards'.
+
+    Source: the lesson, section 2.
+
+    >>> reinforce_whole(jnp.array([1.0, 2.0]), 0.5).advantage.tolist()
+    [2.0, 2.0]
+    """
+    returns = whole_returns(reward, discount)
+    target = discounted_returns(reward, discount, 0.0)
+    return Estimate(returns - spread(baseline, returns, "baseline"), target)
 
 
 def td_zero(reward: jax.Array, discount: jax.Array | float, value: jax.Array, next_value: jax.Array) -> Estimate:
@@ -130,6 +110,38 @@ def td_zero(reward: jax.Array, discount: jax.Array | float, value: jax.Array, ne
     """
     advantage = td_errors(reward, discount, value, next_value)
     return Estimate(advantage, advantage + value)
+
+
+def n_step(
+    reward: jax.Array,
+    discount: jax.Array | float,
+    value: jax.Array,
+    next_value: jax.Array,
+    n: int,
+    continues: jax.Array | float = 1.0,
+) -> Estimate:
+    """n rewards, then the critic: between TD(0), n = 1, and Monte Carlo minus value, n >= T.
+
+        A_t = G^(n)_t - V(s_t)
+
+    Args:
+      reward: r_t, `[T, ...]`.
+      discount: d_t, `[T, ...]` or a scalar; 0 where s_{t+1} is terminal.
+      value: V(s_t), `[T, ...]`.
+      next_value: V of the true s_{t+1}, `[T, ...]`.
+      n: how many rewards to sum, at least 1.
+      continues: 0 at a cut, else 1, `[T, ...]` or a scalar.
+
+    Raises:
+      ValueError: n is below 1, or an array's shape does not fit the rewards'.
+
+    Source: Sutton and Barto, Reinforcement Learning (2018), equation 7.1.
+
+    >>> n_step(jnp.ones(3), 1.0, jnp.zeros(3), jnp.array([5.0, 6.0, 7.0]), n=2).advantage.tolist()
+    [8.0, 9.0, 8.0]
+    """
+    returns = n_step_returns(reward, discount, next_value, n, continues)
+    return Estimate(returns - same(value, returns, "value"), returns)
 
 
 def td_lambda(

@@ -40,6 +40,53 @@ def discounted_returns(reward: jax.Array, discount: jax.Array | float, bootstrap
     return _backward(reward, discount, bootstrap)
 
 
+def whole_returns(reward: jax.Array, discount: jax.Array | float) -> jax.Array:
+    """The return of the whole trajectory, at each of its steps.
+
+        R(tau) = sum_t d_0 ... d_{t-1} r_t,    the same for all t
+
+    With it as A_t the gradient is exactly that of J, factor gamma^t included: each score is multiplied by rewards
+    that came before it too, which changes no mean and adds variance.
+
+    Args:
+      reward: r_t, `[T, ...]`, 0 after the end of an episode.
+      discount: d_t, `[T, ...]` or a scalar.
+
+    Raises:
+      ValueError: an array's shape does not fit the rewards'.
+
+    Source: the lesson, section 2.
+
+    >>> whole_returns(jnp.array([1.0, 1.0, 1.0]), 0.5).tolist()
+    [1.75, 1.75, 1.75]
+    """
+    returns = discounted_returns(reward, discount, 0.0)
+    return jnp.broadcast_to(returns[0], returns.shape)
+
+
+def discount_factors(discount: jax.Array) -> jax.Array:
+    """The factor gamma^t of the policy-gradient theorem.
+
+        d_0 d_1 ... d_{t-1},    1 at t = 0
+
+    Times the advantages of `jaxpg.estimators` it makes the estimate that of grad J. The lesson's section 3, and nearly
+    every program, leaves it out: steps late in an episode then count as much as early ones.
+
+    Args:
+      discount: d_t, `[T, ...]`, of trajectories that begin at t = 0.
+
+    Returns:
+      `[T, ...]`.
+
+    Source: Sutton and Barto, Reinforcement Learning (2018), section 13.3; Nota and Thomas, arXiv 1906.07073.
+
+    >>> discount_factors(jnp.array([0.5, 0.5, 0.5])).tolist()
+    [1.0, 0.5, 0.25]
+    """
+    discount = floating(discount)
+    return jnp.cumprod(jnp.concatenate([jnp.ones_like(discount[:1]), discount[:-1]]), axis=0)
+
+
 def td_errors(reward: jax.Array, discount: jax.Array | float, value: jax.Array, next_value: jax.Array) -> jax.Array:
     """One-step temporal-difference errors.
 

@@ -10,7 +10,7 @@ import pytest
 from probes import Constant, Counter, Target
 
 from jaxpg import normalization
-from jaxpg.actor_critic import Method, actor_critic, deterministic_policy, reinforce, sampling_policy, td
+from jaxpg.actor_critic import BASELINES, Method, actor_critic, deterministic_policy, reinforce, sampling_policy, td
 from jaxpg.estimators import td_lambda
 from jaxpg.evaluation import evaluate
 from jaxpg.networks import mlp_networks
@@ -40,9 +40,9 @@ def td_truncation_as_termination(gamma, lambda_, num_steps):
     """The usual mistake: a time limit taken for a terminal state."""
     right = td(gamma, lambda_, num_steps)
 
-    def estimate(transition, weight, value, next_value):
+    def estimate(transition, weight, value, next_value, squared_score):
         wrong = transition._replace(terminated=transition.terminated + transition.truncated)
-        return right.estimate(wrong, weight, value, next_value)
+        return right.estimate(wrong, weight, value, next_value, squared_score)
 
     return right._replace(estimate=estimate)
 
@@ -50,7 +50,7 @@ def td_truncation_as_termination(gamma, lambda_, num_steps):
 def td_through_the_reset(gamma, lambda_, num_steps):
     """Another: the lambda-sum runs on into the next episode."""
 
-    def estimate(transition, weight, value, next_value):
+    def estimate(transition, weight, value, next_value, squared_score):
         discount = gamma * (1 - transition.terminated)
         return td_lambda(transition.reward, discount, value, next_value, lambda_)
 
@@ -77,7 +77,12 @@ def counter_advantages(method):
     policy_fn = sampling_policy(networks, params, statistics)
     _, steps = method.collect(vector, policy_fn, vector.reset(new_key()), jax.random.key(1))
     value, next_value = (networks.value(params["critic"], obs) for obs in (steps.obs, steps.next_obs))
-    return steps, value, next_value, method.estimate(steps, method.weight(steps), value, next_value)
+    return (
+        steps,
+        value,
+        next_value,
+        method.estimate(steps, method.weight(steps), value, next_value, jnp.ones_like(value)),
+    )
 
 
 def test_lambda_sum_stops_at_the_time_limit():
@@ -99,13 +104,11 @@ def test_reinforce_returns_are_those_of_whole_episodes():
     _, steps = method.collect(vector, policy_fn, vector.reset(new_key()), jax.random.key(1))
     weight = method.weight(steps)
     np.testing.assert_array_equal(weight[:, 0], [1, 1, 1, 0, 0])
-    estimate = method.estimate(steps, weight, jnp.zeros((5, 4)), jnp.zeros((5, 4)))
+    estimate = method.estimate(steps, weight, *jnp.zeros((3, 5, 4)))
     np.testing.assert_array_equal(estimate.advantage[:3, 0], [3, 2, 1])
 
 
-@pytest.mark.parametrize(
-    "method", [td(0.9, 0.95, 4), reinforce(0.9, "none"), reinforce(0.9, "mean"), reinforce(0.9, "value")]
-)
+@pytest.mark.parametrize("method", [td(0.9, 0.95, 4), *(reinforce(0.9, baseline) for baseline in BASELINES)])
 def test_finds_the_best_action_of_a_one_step_task(method):
     networks, algorithm = make(Target(), method, num_envs=64, episode_length=2, learning_rate=1e-2)
     state, _ = jax.jit(lambda key: train_scan(algorithm, key, 400))(new_key())
@@ -170,7 +173,7 @@ def test_policy_is_not_moved_by_the_critics_error():
     """With zero rewards, a zero discount and no normalization the advantage is -V(s): the actor learns, from V alone;
     with the advantage replaced by 0 it must not move at all, although the critic has an error."""
 
-    def no_advantage(transition, weight, value, next_value):
+    def no_advantage(transition, weight, value, next_value, squared_score):
         estimate = td_lambda(transition.reward, 0.9, value, next_value, 0.95)
         return estimate._replace(advantage=jnp.zeros_like(value))
 

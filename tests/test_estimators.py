@@ -10,16 +10,16 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from jaxpg.estimators import (
-    normalize_advantages,
-    reinforce,
-    reinforce_mean_baseline,
-    reinforce_value_baseline,
-    td_lambda,
-    td_zero,
-)
+from jaxpg.baselines import batch_mean, leave_one_out, optimal, time_mean
+from jaxpg.estimators import n_step, normalize_advantages, reinforce, reinforce_whole, td_lambda, td_zero
+from jaxpg.returns import discounted_returns
 
 SHAPES = [(1,), (7, 3), (5, 3, 2)]
+
+
+def less_the_mean(reward, discount, weight=1.0):
+    """REINFORCE with the mean return of the batch as baseline."""
+    return reinforce(reward, discount, batch_mean(discounted_returns(reward, discount, 0.0), weight))
 
 
 class Steps(NamedTuple):
@@ -94,7 +94,7 @@ def test_reinforce_is_the_return(shape):
 def test_mean_baseline_subtracts_one_number_from_every_return(shape):
     steps = trajectory(shape)
     returns = loop_returns(steps.reward, steps.discount)
-    estimate = reinforce_mean_baseline(steps.reward, steps.discount)
+    estimate = less_the_mean(steps.reward, steps.discount)
     assert_close(estimate.advantage, returns - sum(returns.ravel()) / returns.size)
     assert_close(estimate.target, returns)
 
@@ -106,14 +106,14 @@ def test_mean_baseline_is_the_weighted_mean(shape):
     returns = loop_returns(steps.reward, steps.discount)
     weighted = sum(float(weight[at]) * returns[at] for at in np.ndindex(*shape))
     baseline = weighted / sum(float(weight[at]) for at in np.ndindex(*shape))
-    assert_close(reinforce_mean_baseline(steps.reward, steps.discount, weight).advantage, returns - baseline)
+    assert_close(less_the_mean(steps.reward, steps.discount, weight).advantage, returns - baseline)
 
 
 @pytest.mark.parametrize("shape", SHAPES)
 def test_value_baseline_is_monte_carlo_minus_value(shape):
     steps = trajectory(shape)
     returns = loop_returns(steps.reward, steps.discount)
-    estimate = reinforce_value_baseline(steps.reward, steps.discount, steps.value)
+    estimate = reinforce(steps.reward, steps.discount, steps.value)
     assert_close(estimate.advantage, returns - steps.value)
     assert_close(estimate.target, returns)
 
@@ -154,13 +154,13 @@ def test_td_lambda_without_lambda_is_td_zero(shape):
 def test_td_lambda_one_is_monte_carlo_minus_value_in_complete_episodes():
     steps = trajectory((7, 3))
     steps.discount[-1] = 0.0
-    expected = reinforce_value_baseline(*steps[:3])
+    expected = reinforce(*steps[:3])
     for left, right in zip(td_lambda(*steps[:4], 1.0), expected, strict=True):
         assert_close(left, right)
 
 
 ESTIMATORS = {
-    "value_baseline": lambda steps: reinforce_value_baseline(*steps[:3]),
+    "value_baseline": lambda steps: reinforce(*steps[:3]),
     "td_zero": lambda steps: td_zero(*steps[:4]),
     "td_lambda": lambda steps: td_lambda(*steps[:5]),
 }
@@ -207,8 +207,8 @@ def test_mean_baseline_ignores_masked_steps():
     reward, discount, weight = finished_episodes()
     other = np.where(weight == 1, reward, reward + 100.0)
     counted = weight == 1
-    left = np.asarray(reinforce_mean_baseline(reward, discount, weight).advantage)
-    right = np.asarray(reinforce_mean_baseline(other, discount, weight).advantage)
+    left = np.asarray(less_the_mean(reward, discount, weight).advantage)
+    right = np.asarray(less_the_mean(other, discount, weight).advantage)
     np.testing.assert_array_equal(left[counted], right[counted])
     assert_close(left[counted].sum(), 0.0)
 
@@ -217,7 +217,7 @@ def test_mean_baseline_without_weights_would_count_masked_steps():
     """The control: the same change is seen when every entry counts."""
     reward, discount, weight = finished_episodes()
     other = np.where(weight == 1, reward, reward + 100.0)
-    left, right = (np.asarray(reinforce_mean_baseline(x, discount).advantage) for x in (reward, other))
+    left, right = (np.asarray(less_the_mean(x, discount).advantage) for x in (reward, other))
     assert np.all(np.abs(left - right)[weight == 1] > 1.0)
 
 
@@ -243,14 +243,14 @@ def test_reinforce_is_unbiased():
 
 
 def test_mean_baseline_shrinks_the_expected_gradient_by_one_minus_one_over_n():
-    gradient = expected_gradient(lambda reward: reinforce_mean_baseline(reward, 0.0).advantage)
+    gradient = expected_gradient(lambda reward: less_the_mean(reward, 0.0).advantage)
     assert gradient == pytest.approx((1 - 1 / N) * TRUE_GRADIENT, rel=1e-5)
 
 
 @pytest.mark.parametrize("value", [-1.0, 0.0, 4.0])
 def test_value_baseline_is_unbiased_whatever_the_critic_says(value):
     critic = jnp.full((1, N), value)
-    gradient = expected_gradient(lambda reward: reinforce_value_baseline(reward, 0.0, critic).advantage)
+    gradient = expected_gradient(lambda reward: reinforce(reward, 0.0, critic).advantage)
     assert gradient == pytest.approx(TRUE_GRADIENT, rel=1e-5)
 
 
@@ -309,8 +309,12 @@ def test_constant_batch_is_normalized_to_zero():
     ("name", "call"),
     [
         ("discount", lambda x, wrong: reinforce(x, wrong)),
-        ("discount", lambda x, wrong: reinforce_mean_baseline(x, wrong)),
-        ("value", lambda x, wrong: reinforce_value_baseline(x, 1.0, wrong)),
+        ("discount", lambda x, wrong: reinforce_whole(x, wrong)),
+        ("baseline", lambda x, wrong: reinforce(x, 1.0, wrong)),
+        ("baseline", lambda x, wrong: reinforce_whole(x, 1.0, wrong)),
+        ("value", lambda x, wrong: n_step(x, 1.0, wrong, x, 2)),
+        ("next_value", lambda x, wrong: n_step(x, 1.0, x, wrong, 2)),
+        ("continues", lambda x, wrong: n_step(x, 1.0, x, x, 2, wrong)),
         ("value", lambda x, wrong: td_zero(x, 1.0, wrong, x)),
         ("next_value", lambda x, wrong: td_zero(x, 1.0, x, wrong)),
         ("value", lambda x, wrong: td_lambda(x, 1.0, wrong, x, 1.0)),
@@ -324,6 +328,58 @@ def test_a_shape_that_would_be_spread_in_silence_raises(name, call, wrong):
 
 
 @pytest.mark.parametrize("wrong", [(3,), (4, 1)])
-def test_a_weight_that_would_be_spread_in_silence_raises(wrong):
-    with pytest.raises(ValueError, match="weight"):
-        reinforce_mean_baseline(jnp.ones((4, 3)), 1.0, jnp.ones(wrong))
+@pytest.mark.parametrize("baseline", [batch_mean, time_mean, leave_one_out])
+def test_a_weight_that_would_be_spread_in_silence_raises(wrong, baseline):
+    with pytest.raises(ValueError, match="weight has shape"):
+        baseline(jnp.ones((4, 3)), jnp.ones(wrong))
+
+
+def test_a_squared_score_that_would_be_spread_in_silence_raises():
+    with pytest.raises(ValueError, match="squared_score has shape"):
+        optimal(jnp.ones((4, 3)), jnp.ones((4, 1)))
+
+
+def test_leaving_one_out_needs_another():
+    with pytest.raises(ValueError, match="at least 2 trajectories"):
+        leave_one_out(jnp.ones((4, 1)))
+
+
+def test_baselines_by_loops():
+    reward, discount, weight = finished_episodes()
+    returns = loop_returns(reward * weight, discount)
+    score = np.random.default_rng(3).uniform(0.1, 2.0, returns.shape)
+    counted = weight == 1
+    for i in range(3):
+        others = np.delete(returns, i, 1)[np.delete(counted, i, 1)]
+        assert_close(leave_one_out(returns.astype("f4"), weight)[:, i], np.full(5, others.mean()))
+    for t in range(5):
+        at = counted[t]
+        mean = returns[t, at].mean() if at.any() else 0.0
+        best = np.average(returns[t, at], weights=score[t, at]) if at.any() else 0.0
+        assert_close(time_mean(returns.astype("f4"), weight)[t], np.full(3, mean))
+        assert_close(optimal(returns.astype("f4"), score.astype("f4"), weight)[t], np.full(3, best))
+
+
+def test_a_step_that_counts_for_nobody_has_baseline_zero():
+    returns, weight = jnp.ones((2, 3)), jnp.array([[1.0] * 3, [0.0] * 3])
+    np.testing.assert_array_equal(time_mean(returns, weight), weight)
+
+
+@pytest.mark.parametrize("shape", SHAPES)
+@pytest.mark.parametrize("n", [1, 3, 10])
+def test_n_step_goes_from_td_zero_to_monte_carlo(shape, n):
+    """Without cuts; with cuts the returns themselves are tested in test_returns."""
+    steps = trajectory(shape)
+    found = n_step(*steps[:4], n)
+    assert_close(found.target - steps.value, np.asarray(found.advantage))
+    if n == 1:
+        assert_close(found.advantage, np.asarray(td_zero(*steps[:4]).advantage))
+
+
+@pytest.mark.parametrize("shape", SHAPES)
+def test_whole_return_is_that_of_the_first_step(shape):
+    steps = trajectory(shape)
+    found = reinforce_whole(steps.reward, steps.discount, 2.0)
+    returns = loop_returns(steps.reward, steps.discount)
+    assert_close(found.advantage, np.broadcast_to(returns[0] - 2.0, shape))
+    assert_close(found.target, returns)

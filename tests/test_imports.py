@@ -11,7 +11,17 @@ ROOT = Path(__file__).parent.parent
 
 # A file imports from its own level or a lower one.
 LEVELS = [
-    {"types", "shapes", "returns", "estimators", "losses", "distributions", "normalization", "compatibility"},
+    {
+        "types",
+        "shapes",
+        "returns",
+        "baselines",
+        "estimators",
+        "losses",
+        "distributions",
+        "normalization",
+        "compatibility",
+    },
     {"networks", "vector_env"},
     {"rollout", "actor_critic", "training", "evaluation"},
     {"run", "train", "evaluate"},

@@ -1,0 +1,121 @@
+"""Baselines: what is subtracted from a return without changing the mean of the gradient, to make it vary less.
+
+    grad J = E[sum_t grad log pi(a_t | s_t) (G_t - b_t)]      for every b_t that does not depend on a_t
+
+| function        | b_t of trajectory i              | bias of the gradient   | when to use                     |
+|-----------------|----------------------------------|------------------------|---------------------------------|
+| `batch_mean`    | mean of all returns              | of the order of 1/N    | the simplest; large batches     |
+| `time_mean`     | mean of the returns at step t    | a share of exactly 1/N | returns fall with the time left |
+| `optimal`       | the same, by squared score       | of the order of 1/N    | scores of very different size   |
+| `leave_one_out` | mean of the other trajectories   | none                   | small batches                   |
+| V(s_t)          | a learned value                  | none                   | returns depend on the state     |
+
+N is the number of trajectories; the first three hold the trajectory's own return. All take returns `[T, N]`, time
+first, and give an array of that shape. A learned value is no function of returns: it comes from a network, and is
+free of bias as long as it was not fitted to the trajectories that it is subtracted from.
+"""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+
+from jaxpg.shapes import same, spread
+
+
+def batch_mean(returns: jax.Array, weight: jax.Array | float = 1.0) -> jax.Array:
+    """The mean return of the batch.
+
+        b = sum_{t,i} w_{t,i} G_{t,i} / sum_{t,i} w_{t,i}
+
+    The mean contains the sample itself: a bias of the order of 1/N for N trajectories, and the factor 1 - 1/N in
+    episodes of one step.
+
+    Args:
+      returns: G_t, `[T, ...]`.
+      weight: 1 where the step belongs to the episode and 0 after its end, `[T, ...]` or a scalar.
+
+    Raises:
+      ValueError: the weight's shape does not fit.
+
+    Source: the lesson, section 3.1 (a baseline that is the same for every state).
+
+    >>> batch_mean(jnp.array([3.0, 2.0])).tolist()
+    [2.5, 2.5]
+    """
+    weight = spread(weight, returns, "weight")
+    return jnp.broadcast_to(jnp.sum(weight * returns) / jnp.sum(weight), returns.shape)
+
+
+def time_mean(returns: jax.Array, weight: jax.Array | float = 1.0) -> jax.Array:
+    """The mean return of the trajectories at each step.
+
+        b_t = sum_i w_{t,i} G_{t,i} / sum_i w_{t,i}
+
+    It contains the sample itself, which shrinks the expected gradient by exactly 1 - 1/N where all N trajectories last.
+
+    Args:
+      returns: G_t, `[T, ...]`.
+      weight: as in `batch_mean`; at a step that counts for nobody b_t is 0.
+
+    Raises:
+      ValueError: the weight's shape does not fit.
+
+    >>> time_mean(jnp.array([[1.0, 3.0], [0.0, 1.0]])).tolist()
+    [[2.0, 2.0], [0.5, 0.5]]
+    """
+    return optimal(returns, jnp.ones_like(returns), weight)
+
+
+def leave_one_out(returns: jax.Array, weight: jax.Array | float = 1.0) -> jax.Array:
+    """The mean return of the other trajectories.
+
+        b_i = sum_{t, j != i} w_{t,j} G_{t,j} / sum_{t, j != i} w_{t,j}
+
+    Independent of trajectory i, and so exactly unbiased for every N.
+
+    Args:
+      returns: G_t, `[T, N]` with N of at least 2.
+      weight: as in `batch_mean`.
+
+    Raises:
+      ValueError: a single trajectory, which has no others, or a shape that does not fit.
+
+    Source: Kool et al., Buy 4 REINFORCE samples, get a baseline for free! (2019).
+
+    >>> leave_one_out(jnp.array([[1.0, 3.0, 5.0]])).tolist()
+    [[4.0, 3.0, 2.0]]
+    """
+    if returns.ndim != 2 or returns.shape[1] < 2:
+        raise ValueError(f"returns have shape {returns.shape}, expected [T, N] with at least 2 trajectories")
+    weight = spread(weight, returns, "weight")
+    total, count = jnp.sum(weight * returns, axis=0), jnp.sum(weight, axis=0)
+    return jnp.broadcast_to((jnp.sum(total) - total) / (jnp.sum(count) - count), returns.shape)
+
+
+def optimal(returns: jax.Array, squared_score: jax.Array, weight: jax.Array | float = 1.0) -> jax.Array:
+    """The number at each step that makes the gradient's term of that step vary least.
+
+        b_t = sum_i w_{t,i} |score_{t,i}|^2 G_{t,i} / sum_i w_{t,i} |score_{t,i}|^2
+
+    It minimises E|score_t (G_t - b_t)|^2 over the b_t that depend on t alone; the sample itself is in the mean, which
+    biases the gradient by a share of the order of 1/N.
+
+    Args:
+      returns: G_t, `[T, ...]`.
+      squared_score: |grad log pi(a_t | s_t)|^2, `[T, ...]`; of the whole gradient or of the part to be quietened.
+      weight: as in `batch_mean`; at a step that counts for nobody b_t is 0.
+
+    Raises:
+      ValueError: a shape does not fit.
+
+    Source: Greensmith, Bartlett and Baxter, Journal of Machine Learning Research 5 (2004), section 4.
+
+    >>> optimal(jnp.array([[1.0, 3.0]]), jnp.array([[3.0, 1.0]])).tolist()
+    [[1.5, 1.5]]
+    """
+    weight = spread(weight, returns, "weight") * same(squared_score, returns, "squared_score")
+    across = tuple(range(1, returns.ndim))
+    total = jnp.sum(weight, axis=across, keepdims=True)
+    mean = jnp.sum(weight * returns, axis=across, keepdims=True) / jnp.where(total == 0, 1, total)
+    return jnp.broadcast_to(mean, returns.shape)
