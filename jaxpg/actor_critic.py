@@ -7,6 +7,7 @@ is made of them.
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 from typing import NamedTuple
 
 import jax
@@ -18,7 +19,7 @@ from jaxpg.distributions import gaussian_entropy, gaussian_sample, squashed_gaus
 from jaxpg.estimators import Estimate
 from jaxpg.losses import entropy_loss, policy_gradient_loss, value_loss
 from jaxpg.networks import Networks
-from jaxpg.returns import discounted_returns
+from jaxpg.returns import discount_factors, discounted_returns, whole_returns
 from jaxpg.rollout import PolicyFn, rollout
 from jaxpg.types import Algorithm, Metrics, PyTree, TrainState, Transition
 from jaxpg.vector_env import VectorEnv, VectorState, stagger
@@ -41,7 +42,10 @@ class Method(NamedTuple):
     estimate: Callable[[Transition, jax.Array, jax.Array, jax.Array, jax.Array], Estimate]
 
 
-def td(gamma: float, lambda_: float, num_steps: int) -> Method:
+ESTIMATORS = ("td_lambda", "td_zero", "n_step", "monte_carlo")
+
+
+def td(gamma: float, lambda_: float, num_steps: int, estimator: str = "td_lambda", n: int = 5) -> Method:
     """Temporal differences: short rollouts that go on where the last one stopped, and bootstrap.
 
     Termination sets the discount to 0. A time limit or the end of the rollout stops the lambda-sum and bootstraps
@@ -51,7 +55,10 @@ def td(gamma: float, lambda_: float, num_steps: int) -> Method:
       gamma: discount, in [0, 1].
       lambda_: 0 for the one-step TD error, 1 for Monte Carlo with a bootstrap at cuts.
       num_steps: T, length of a rollout.
+      estimator: one of `ESTIMATORS`; td_zero and monte_carlo are td_lambda with lambda 0 and 1.
+      n: rewards that n_step sums.
     """
+    lambda_ = {"td_zero": 0.0, "monte_carlo": 1.0}.get(estimator, lambda_)
 
     def start(env, key):
         key_reset, key_stagger = jax.random.split(key)
@@ -63,6 +70,8 @@ def td(gamma: float, lambda_: float, num_steps: int) -> Method:
     def estimate(transition, weight, value, next_value, squared_score):
         discount = gamma * (1 - transition.terminated)
         continues = 1 - transition.truncated
+        if estimator == "n_step":
+            return estimators.n_step(transition.reward, discount, value, next_value, n, continues)
         return estimators.td_lambda(transition.reward, discount, value, next_value, lambda_ * continues)
 
     return Method(start, collect, lambda transition: jnp.ones_like(transition.reward), estimate)
@@ -71,13 +80,21 @@ def td(gamma: float, lambda_: float, num_steps: int) -> Method:
 BASELINES = ("none", "mean", "time_mean", "leave_one_out", "optimal", "value")
 
 
-def reinforce(gamma: float, baseline: str) -> Method:
+RETURNS = ("to_go", "whole")
+
+
+def reinforce(gamma: float, baseline: str, returns: str = "to_go", discounted: bool = False) -> Method:
     """REINFORCE: whole episodes from a fresh reset to the time limit, masked after termination; no bootstrap.
 
     Args:
       gamma: discount, in [0, 1].
       baseline: one of `BASELINES`.
+      returns: "to_go" from each step on, or the "whole" return of the episode at each of its steps.
+      discounted: advantages times gamma^t, which makes the estimate that of the gradient of J; with whole returns it is
+        so without.
     """
+    of_rewards = {"to_go": partial(discounted_returns, bootstrap=0.0), "whole": whole_returns}[returns]
+    estimator = {"to_go": estimators.reinforce, "whole": estimators.reinforce_whole}[returns]
 
     def collect(env, policy_fn, env_state, key):
         key_reset, key_rollout = jax.random.split(key)
@@ -91,16 +108,19 @@ def reinforce(gamma: float, baseline: str) -> Method:
     def estimate(transition, weight, value, next_value, squared_score):
         reward = weight * transition.reward
         discount = gamma * (1 - transition.terminated)
-        returns = discounted_returns(reward, discount, 0.0)
+        earned = of_rewards(reward, discount)
         subtracted = {
             "none": lambda: 0.0,
-            "mean": lambda: baselines.batch_mean(returns, weight),
-            "time_mean": lambda: baselines.time_mean(returns, weight),
-            "leave_one_out": lambda: baselines.leave_one_out(returns, weight),
-            "optimal": lambda: baselines.optimal(returns, squared_score, weight),
+            "mean": lambda: baselines.batch_mean(earned, weight),
+            "time_mean": lambda: baselines.time_mean(earned, weight),
+            "leave_one_out": lambda: baselines.leave_one_out(earned, weight),
+            "optimal": lambda: baselines.optimal(earned, squared_score, weight),
             "value": lambda: value,
         }[baseline]()
-        return estimators.reinforce(reward, discount, subtracted)
+        advantage, target = estimator(reward, discount, subtracted)
+        if discounted:
+            advantage = discount_factors(discount) * advantage
+        return Estimate(advantage, target)
 
     return Method(lambda env, key: env.reset(key), collect, weight, estimate)
 

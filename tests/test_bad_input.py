@@ -36,6 +36,13 @@ MISTAKES = {
     "seeds beyond 32 bits": (["seed=4294967295", "num_seeds=2"], "seeds must stay below 2**32"),
     "negative mass": (["env.mass=-1"], "env.mass=-1: must be above 0"),
     "rollout length of whole episodes": (["algo=reinforce", "num_steps=10"], "algo=reinforce plays whole episodes"),
+    "leave nobody": (["algo=reinforce", "algo.baseline=leave_one_out", "num_envs=1"], "num_envs must be at least 2"),
+    "factors twice": (
+        ["algo=reinforce", "algo.returns=whole", "algo.discounted=true"],
+        "algo.discounted=true: whole returns have the factors gamma^t in them",
+    ),
+    "no rewards to sum": (["algo.estimator=n_step", "algo.n=0"], "algo.n=0: must be at least 1"),
+    "unknown estimator": (["algo.estimator=gae"], "must be td_lambda or td_zero or n_step or monte_carlo"),
     "goal out of reach": (["env=arm", "env.goal_max=2"], "goals must lie in the reachable ring"),
     "unknown brax environment": (
         ["env=brax", "env.name=reachr"],

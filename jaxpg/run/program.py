@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import optax
 
 import envs
-from jaxpg.actor_critic import actor_critic, deterministic_policy, reinforce, td
+from jaxpg.actor_critic import Method, actor_critic, deterministic_policy, reinforce, td
 from jaxpg.evaluation import Episodes, evaluate
 from jaxpg.networks import Networks, mlp_networks
 from jaxpg.run.config import Config
@@ -99,20 +99,23 @@ def make_networks(config: Config, env: Any) -> Networks:
 def make_algorithm(config: Config, env: Any) -> Algorithm:
     """One agent's algorithm, as pure functions."""
     algo, run = config.algo, config.run
-    if config.choices["algo"] == "td":
-        method = td(algo.gamma, algo.lambda_, run.num_steps)
-    else:
-        method = reinforce(algo.gamma, algo.baseline)
     return actor_critic(
         vectorize(env, run.num_envs, config.env.episode_length),
         make_networks(config, env),
         make_optimizer(config),
-        method,
+        make_method(config),
         reward_scale=algo.reward_scale,
         entropy_coef=algo.entropy_coef,
         normalize_observations=algo.normalize_observations,
         normalize_advantages=algo.normalize_advantages,
     )
+
+
+def make_method(config: Config) -> Method:
+    algo = config.algo
+    if config.choices["algo"] == "td":
+        return td(algo.gamma, algo.lambda_, config.run.num_steps, algo.estimator, algo.n)
+    return reinforce(algo.gamma, algo.baseline, algo.returns, algo.discounted)
 
 
 def make_optimizer(config: Config) -> optax.GradientTransformation:

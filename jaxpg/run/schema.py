@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 import envs
 from envs.options import option
-from jaxpg.actor_critic import BASELINES
+from jaxpg.actor_critic import BASELINES, ESTIMATORS, RETURNS
 from jaxpg.networks import ACTIVATIONS
 
 
@@ -33,6 +33,8 @@ class Learning:
 class TD(Learning):
     """Temporal differences: TD(lambda) actor-critic; lambda_=0 is the one-step TD error."""
 
+    estimator: str = option("td_lambda", "advantage: td_zero and monte_carlo are lambda 0 and 1", choices=ESTIMATORS)
+    n: int = option(5, "rewards that n_step sums", at_least=1)
     lambda_: float = option(0.95, "weight of longer returns: 0 is TD(0), 1 Monte Carlo", at_least=0, at_most=1)
 
 
@@ -41,6 +43,8 @@ class Reinforce(Learning):
     """REINFORCE: complete episodes, Monte Carlo returns."""
 
     baseline: str = option("value", "what is subtracted from the return", choices=BASELINES)
+    returns: str = option("to_go", "from each step on, or of the whole episode", choices=RETURNS)
+    discounted: bool = option(False, "advantages times gamma^t, as the gradient of the objective has them")
 
 
 @dataclass(frozen=True)
