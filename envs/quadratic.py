@@ -93,38 +93,31 @@ def zero(problem: Problem) -> Quadratic:
 def backup(problem: Problem, policy: Policy, following: Quadratic) -> Quadratic:
     """s -> E[r_t + gamma following(s_{t+1}) | s_t = s] under the policy.
 
-    With F = A + B K, following = -(s' P s + 2 p' s + c), M = Q + gamma P, m = gamma p, H = B' M B + R, the result has
+    With (P, p, c) of `action_value` and the actions a = K s + k + sigma epsilon, (s, K s + k) = L s + o:
 
-        F' M F + K' R K,    F' (M B k + m) + K' R k,    k' H k + 2 m' B k + tr(M W) + sigma^2 tr(H) + gamma c
+        L' P L,    L' (P o + p),    o' P o + 2 p' o + c + sigma^2 tr(P_aa)
     """
-    B, R = problem.B, problem.R
     K, k, sigma = policy
-    F = problem.A + B @ K
-    M, m, c = _cost_to_go(problem, following)
-    H = B.T @ M @ B + R
-    return Quadratic(
-        F.T @ M @ F + K.T @ R @ K,
-        F.T @ (M @ B @ k + m) + K.T @ R @ k,
-        k @ H @ k + 2 * m @ B @ k + sigma**2 * np.trace(H) + c,
-    )
+    n = len(problem.A)
+    P, p, c = action_value(problem, following)
+    L, o = np.concatenate([np.eye(n), K]), np.concatenate([np.zeros(n), k])
+    return Quadratic(L.T @ P @ L, L.T @ (P @ o + p), o @ P @ o + 2 * p @ o + c + sigma**2 * np.trace(P[n:, n:]))
 
 
 def action_value(problem: Problem, following: Quadratic) -> Quadratic:
     """(s, a) -> E[r_t + gamma following(s_{t+1}) | s_t = s, a_t = a], of the vector that joins s and a.
 
-    Q_t is that of V_{t+1}.
+    Q_t is that of V_{t+1}. With following = -(x' P x + 2 p' x + c), M = Q + gamma P, and E = (A, B) side by side:
+
+        E' M E + diag(0, R),    gamma E' p,    tr(M W) + gamma c
     """
     both = np.concatenate([problem.A, problem.B], axis=1)
-    M, m, c = _cost_to_go(problem, following)
-    P = both.T @ M @ both
-    P[-len(problem.R) :, -len(problem.R) :] += problem.R
-    return Quadratic(P, both.T @ m, c)
-
-
-def _cost_to_go(problem: Problem, following: Quadratic) -> Quadratic:
-    """The cost of x = A s + B a: of x and of what follows, the noise averaged."""
+    n = len(problem.A)
     M = problem.Q + problem.discount * following.P
-    return Quadratic(M, problem.discount * following.p, np.trace(M @ problem.W) + problem.discount * following.c)
+    P = both.T @ M @ both
+    P[n:, n:] += problem.R
+    constant = np.trace(M @ problem.W) + problem.discount * following.c
+    return Quadratic(P, problem.discount * both.T @ following.p, constant)
 
 
 def lambda_targets(problem: Problem, policy: Policy, critic: list[Quadratic], lambda_: float) -> list[Quadratic]:
@@ -170,11 +163,11 @@ def gradient(
 ) -> Policy:
     """The gradient of J with respect to K, k and log sigma (in the place of sigma), by the policy-gradient theorem.
 
-        dJ/dK         = sum_t gamma^t E[g_t(s_t) s_t'],    g_t(s) = -2 (H_t (K s + k) + B' (M_t A s + m_t))
+        dJ/dK         = sum_t gamma^t E[g_t(s_t) s_t'],    g_t(s) = -2 (P_aa (K s + k) + P_as s + p_a)
         dJ/dk         = sum_t gamma^t E[g_t(s_t)]
-        dJ/dlog sigma = -2 sigma^2 sum_t gamma^t tr(H_t)
+        dJ/dlog sigma = -2 sigma^2 sum_t gamma^t tr(P_aa)
 
-    where g_t(s) = E[grad_a Q_t(s, a)], and H_t, M_t, m_t are as in `backup`.
+    where g_t(s) = E[grad_a Q_t(s, a)], and P, p are those of Q_t, the `action_value` of V_{t+1}.
 
     Args:
       problem, policy: as above.
@@ -183,31 +176,29 @@ def gradient(
       discounted: without it the factors gamma^t are left out, as in the lesson's section 3 and in most programs. That
         sum is the mean of the estimators that leave them out; it is not the gradient of J.
     """
-    A, B, R = problem.A, problem.B, problem.R
     K, k, sigma = policy
+    n = len(problem.A)
     dK, dk, dlog_sigma = np.zeros_like(K), np.zeros_like(k), 0.0
     following = values(problem, policy)[1:] if following is None else following
     for t, (mean, second) in enumerate(state_moments(problem, policy)):
-        M, m, _ = _cost_to_go(problem, following[t])
-        H = B.T @ M @ B + R
-        slope, offset = H @ K + B.T @ M @ A, H @ k + B.T @ m
+        P, p, _ = action_value(problem, following[t])
+        slope, offset = P[n:, n:] @ K + P[n:, :n], P[n:, n:] @ k + p[n:]
         factor = -2 * (problem.discount**t if discounted else 1.0)
         dK = dK + factor * (slope @ second + np.outer(offset, mean))
         dk = dk + factor * (slope @ mean + offset)
-        dlog_sigma = dlog_sigma + factor * sigma**2 * np.trace(H)
+        dlog_sigma = dlog_sigma + factor * sigma**2 * np.trace(P[n:, n:])
     return Policy(dK, dk, float(dlog_sigma))
 
 
 def riccati_gains(problem: Problem) -> list[np.ndarray]:
     """The optimal K_t for t = 0 ... T - 1: the policy that nothing beats, deterministic and different at each step.
 
-    K_t = -(B' M_t B + R)^-1 B' M_t A,    M_t = Q + gamma P_{t+1},    P_t = A' M_t (A + B K_t),    P_T = 0
+    K_t = -P_aa^-1 P_as    of Q_t, the `action_value` of what the later gains earn
     """
-    A, B = problem.A, problem.B
-    P = np.zeros_like(A)
-    gains = []
+    n, m = problem.B.shape
+    following, gains = zero(problem), []
     for _ in range(problem.horizon):
-        M = problem.Q + problem.discount * P
-        gains.append(-np.linalg.solve(B.T @ M @ B + problem.R, B.T @ M @ A))
-        P = A.T @ M @ (A + B @ gains[-1])
+        P = action_value(problem, following).P
+        gains.append(-np.linalg.solve(P[n:, n:], P[n:, :n]))
+        following = backup(problem, Policy(gains[-1], np.zeros(m), 0.0), following)
     return gains[::-1]

@@ -7,7 +7,6 @@ is made of them.
 from __future__ import annotations
 
 from collections.abc import Callable
-from functools import partial
 from typing import NamedTuple
 
 import jax
@@ -19,7 +18,7 @@ from jaxpg.distributions import gaussian_entropy, gaussian_sample, squashed_gaus
 from jaxpg.estimators import Estimate
 from jaxpg.losses import entropy_loss, policy_gradient_loss, value_loss
 from jaxpg.networks import Networks
-from jaxpg.returns import discount_factors, discounted_returns, whole_returns
+from jaxpg.returns import discount_factors
 from jaxpg.rollout import PolicyFn, rollout
 from jaxpg.types import Algorithm, Metrics, PyTree, TrainState, Transition
 from jaxpg.vector_env import VectorEnv, VectorState, stagger
@@ -77,10 +76,16 @@ def td(gamma: float, lambda_: float, num_steps: int, estimator: str = "td_lambda
     return Method(start, collect, lambda transition: jnp.ones_like(transition.reward), estimate)
 
 
-BASELINES = ("none", "mean", "time_mean", "leave_one_out", "optimal", "value")
-
-
-RETURNS = ("to_go", "whole")
+# What is subtracted from the returns, of (returns, weight, value, squared_score).
+BASELINES: dict[str, Callable[..., jax.Array | float]] = {
+    "none": lambda *_: 0.0,
+    "mean": lambda returns, weight, *_: baselines.batch_mean(returns, weight),
+    "time_mean": lambda returns, weight, *_: baselines.time_mean(returns, weight),
+    "leave_one_out": lambda returns, weight, *_: baselines.leave_one_out(returns, weight),
+    "optimal": lambda returns, weight, _, squared_score: baselines.optimal(returns, squared_score, weight),
+    "value": lambda _, weight, value, squared_score: value,
+}
+RETURNS = {"to_go": estimators.reinforce, "whole": estimators.reinforce_whole}
 
 
 def reinforce(gamma: float, baseline: str, returns: str = "to_go", discounted: bool = False) -> Method:
@@ -88,13 +93,11 @@ def reinforce(gamma: float, baseline: str, returns: str = "to_go", discounted: b
 
     Args:
       gamma: discount, in [0, 1].
-      baseline: one of `BASELINES`.
-      returns: "to_go" from each step on, or the "whole" return of the episode at each of its steps.
+      baseline: a name in `BASELINES`.
+      returns: a name in `RETURNS`: "to_go" is from each step on, "whole" that of the episode, at each of its steps.
       discounted: advantages times gamma^t, which makes the estimate that of the gradient of J; with whole returns it is
         so without.
     """
-    of_rewards = {"to_go": partial(discounted_returns, bootstrap=0.0), "whole": whole_returns}[returns]
-    estimator = {"to_go": estimators.reinforce, "whole": estimators.reinforce_whole}[returns]
 
     def collect(env, policy_fn, env_state, key):
         key_reset, key_rollout = jax.random.split(key)
@@ -108,16 +111,8 @@ def reinforce(gamma: float, baseline: str, returns: str = "to_go", discounted: b
     def estimate(transition, weight, value, next_value, squared_score):
         reward = weight * transition.reward
         discount = gamma * (1 - transition.terminated)
-        earned = of_rewards(reward, discount)
-        subtracted = {
-            "none": lambda: 0.0,
-            "mean": lambda: baselines.batch_mean(earned, weight),
-            "time_mean": lambda: baselines.time_mean(earned, weight),
-            "leave_one_out": lambda: baselines.leave_one_out(earned, weight),
-            "optimal": lambda: baselines.optimal(earned, squared_score, weight),
-            "value": lambda: value,
-        }[baseline]()
-        advantage, target = estimator(reward, discount, subtracted)
+        earned, target = RETURNS[returns](reward, discount)
+        advantage = earned - BASELINES[baseline](earned, weight, value, squared_score)
         if discounted:
             advantage = discount_factors(discount) * advantage
         return Estimate(advantage, target)
@@ -136,10 +131,7 @@ def actor_critic(
     normalize_observations: bool = True,
     normalize_advantages: bool = True,
 ) -> Algorithm:
-    """Policy-gradient training of an actor and a critic, one gradient step for each rollout.
-
-        L(theta, w) = -mean(log pi_theta(a_t | s_t) stop(A_t)) + 1/2 mean((V_w(s_t) - stop(target_t))^2)
-                      - entropy_coef mean(H_t)
+    """Policy-gradient training of an actor and a critic, one gradient step on `actor_critic_loss` for each rollout.
 
     Args:
       env: N environments.
@@ -156,6 +148,8 @@ def actor_critic(
       and the others averaged.
     """
 
+    loss_fn = actor_critic_loss(networks, method, reward_scale, entropy_coef, normalize_advantages)
+
     def init(key: jax.Array) -> TrainState:
         key_params, key_env = jax.random.split(key)
         params = networks.init(key_params)
@@ -167,7 +161,38 @@ def actor_critic(
             update=jnp.zeros((), jnp.int32),
         )
 
-    def loss_fn(params: PyTree, normalizer: PyTree, transition: Transition) -> tuple[jax.Array, Metrics]:
+    def step(state: TrainState, key: jax.Array) -> tuple[TrainState, Metrics]:
+        policy_fn = sampling_policy(networks, state.params, state.normalizer)
+        env_state, transition = method.collect(env, policy_fn, state.env_state, key)
+        gradients, losses = jax.grad(loss_fn, has_aux=True)(state.params, state.normalizer, transition)
+        updates, opt_state = optimizer.update(gradients, state.opt_state, state.params)
+        normalizer = state.normalizer
+        if normalize_observations:
+            normalizer = normalization.update(normalizer, transition.obs)
+        metrics = losses | {
+            "gradient_norm": optax.tree.norm(gradients),
+            "return_sum": jnp.sum(transition.episode_return),
+            "episodes": jnp.sum(transition.episode_end),
+        }
+        params = optax.apply_updates(state.params, updates)
+        return TrainState(params, opt_state, normalizer, env_state, state.update + 1), metrics
+
+    return Algorithm(init, step)
+
+
+def actor_critic_loss(
+    networks: Networks, method: Method, reward_scale: float, entropy_coef: float, normalize_advantages: bool
+) -> Callable[[PyTree, PyTree, Transition], tuple[jax.Array, Metrics]]:
+    """`loss(params, normalizer, transition) -> (L, metrics)` of a rollout.
+
+        L(theta, w) = -mean(log pi_theta(a_t | s_t) stop(A_t)) + 1/2 mean((V_w(s_t) - stop(target_t))^2)
+                      - entropy_coef mean(H_t)
+
+    Args:
+      networks, method, reward_scale, entropy_coef, normalize_advantages: as in `actor_critic`.
+    """
+
+    def loss(params, normalizer, transition):
         obs = normalization.normalize(normalizer, transition.obs)
         next_obs = normalization.normalize(normalizer, transition.next_obs)
         value = networks.value(params["critic"], obs)
@@ -190,23 +215,7 @@ def actor_critic(
         total = losses["policy_loss"] + losses["value_loss"] - entropy_coef * losses["entropy"]
         return total, losses | {"sigma": jnp.mean(jnp.exp(log_std)), "value": jnp.mean(value)}
 
-    def step(state: TrainState, key: jax.Array) -> tuple[TrainState, Metrics]:
-        policy_fn = sampling_policy(networks, state.params, state.normalizer)
-        env_state, transition = method.collect(env, policy_fn, state.env_state, key)
-        gradients, losses = jax.grad(loss_fn, has_aux=True)(state.params, state.normalizer, transition)
-        updates, opt_state = optimizer.update(gradients, state.opt_state, state.params)
-        normalizer = state.normalizer
-        if normalize_observations:
-            normalizer = normalization.update(normalizer, transition.obs)
-        metrics = losses | {
-            "gradient_norm": optax.tree.norm(gradients),
-            "return_sum": jnp.sum(transition.episode_return),
-            "episodes": jnp.sum(transition.episode_end),
-        }
-        params = optax.apply_updates(state.params, updates)
-        return TrainState(params, opt_state, normalizer, env_state, state.update + 1), metrics
-
-    return Algorithm(init, step)
+    return loss
 
 
 def sampling_policy(networks: Networks, params: PyTree, normalizer: PyTree) -> PolicyFn:

@@ -26,7 +26,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
-from jaxpg.returns import discounted_returns, lambda_returns, n_step_returns, td_errors, whole_returns
+from jaxpg.returns import discounted_returns, lambda_returns, n_step_returns, td_errors
 from jaxpg.shapes import floating, same, spread
 
 
@@ -69,7 +69,10 @@ def reinforce(reward: jax.Array, discount: jax.Array | float, baseline: jax.Arra
 def reinforce_whole(reward: jax.Array, discount: jax.Array | float, baseline: jax.Array | float = 0.0) -> Estimate:
     """REINFORCE with the return of the whole trajectory, as the theorem is first derived.
 
-        A_t = R(tau) - b,    R(tau) = sum_k d_0 ... d_{k-1} r_k
+        A_t = R(tau) - b,    R(tau) = sum_k d_0 ... d_{k-1} r_k = G_0
+
+    It estimates exactly the gradient of J, factor gamma^t included: each score is multiplied by rewards that came
+    before it too, which changes no mean and adds variance. The critic's target is the return to go.
 
     Args:
       reward: r_t, `[T, ...]`, 0 after the end of an episode.
@@ -83,10 +86,11 @@ def reinforce_whole(reward: jax.Array, discount: jax.Array | float, baseline: ja
 
     >>> reinforce_whole(jnp.array([1.0, 2.0]), 0.5).advantage.tolist()
     [2.0, 2.0]
+    >>> reinforce_whole(jnp.array([1.0, 1.0, 1.0]), 0.5).advantage.tolist()
+    [1.75, 1.75, 1.75]
     """
-    returns = whole_returns(reward, discount)
-    target = discounted_returns(reward, discount, 0.0)
-    return Estimate(returns - spread(baseline, returns, "baseline"), target)
+    returns = discounted_returns(reward, discount, 0.0)
+    return Estimate(returns[0] - spread(baseline, returns, "baseline"), returns)
 
 
 def td_zero(reward: jax.Array, discount: jax.Array | float, value: jax.Array, next_value: jax.Array) -> Estimate:

@@ -40,30 +40,6 @@ def discounted_returns(reward: jax.Array, discount: jax.Array | float, bootstrap
     return _backward(reward, discount, bootstrap)
 
 
-def whole_returns(reward: jax.Array, discount: jax.Array | float) -> jax.Array:
-    """The return of the whole trajectory, at each of its steps.
-
-        R(tau) = sum_t d_0 ... d_{t-1} r_t,    the same for all t
-
-    With it as A_t the gradient is exactly that of J, factor gamma^t included: each score is multiplied by rewards
-    that came before it too, which changes no mean and adds variance.
-
-    Args:
-      reward: r_t, `[T, ...]`, 0 after the end of an episode.
-      discount: d_t, `[T, ...]` or a scalar.
-
-    Raises:
-      ValueError: an array's shape does not fit the rewards'.
-
-    Source: the lesson, section 2.
-
-    >>> whole_returns(jnp.array([1.0, 1.0, 1.0]), 0.5).tolist()
-    [1.75, 1.75, 1.75]
-    """
-    returns = discounted_returns(reward, discount, 0.0)
-    return jnp.broadcast_to(returns[0], returns.shape)
-
-
 def discount_factors(discount: jax.Array) -> jax.Array:
     """The factor gamma^t of the policy-gradient theorem.
 

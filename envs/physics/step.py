@@ -9,7 +9,7 @@ from __future__ import annotations
 import copy
 import functools
 import logging
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING
 
 import jax
@@ -74,13 +74,15 @@ def compile_step(
     if physics == "scalar":
         try:
             program = trace(once, *example)
-            repeated = in_tiles(program, functools.partial(_repeat_program, program, inputs, carried, num_substeps))
+            repeated = in_tiles(program, functools.partial(_program_step, program, inputs, carried, num_substeps))
         except UnsupportedPrimitive as error:
             logger.warning("%s: stepped by mjx.step, not as scalar equations: %s", model_name(model), error)
             once, _ = single_step(_without_lapack(model), inputs, results)
             physics = "mjx"
     if physics == "mjx":
-        repeated = _repeat(once, inputs, carried, num_substeps)
+
+        def repeated(*arrays):
+            return _repeat(lambda values: once(*values), inputs, carried, num_substeps, arrays)
 
     def step(*arrays):
         if len(arrays) != len(inputs):
@@ -113,43 +115,31 @@ def _field(owner, name: str) -> jax.Array:
     return jnp.asarray(owner)
 
 
-def _repeat(once: Callable, inputs, carried, num_substeps: int) -> Callable:
-    """The step with its state fed back."""
-
-    def repeated(*arrays):
-        def substep(state, _):
-            given = dict(zip(inputs, arrays, strict=True)) | dict(zip(carried, state, strict=True))
-            results = once(*(given[name] for name in inputs))
-            return results[: len(carried)], results[len(carried) :]
-
-        state = tuple(array for name, array in zip(inputs, arrays, strict=True) if name in carried)
-        return _loop(substep, state, num_substeps)
-
-    return repeated
-
-
-def _repeat_program(program: Program, inputs, carried, num_substeps: int, stages: list[Stage]) -> Callable:
-    """The same for scalar equations; the elements stay apart until the end."""
+def _program_step(program: Program, inputs, carried, num_substeps: int, stages: list[Stage]) -> Callable:
+    """The substeps of scalar equations; the elements stay apart until the end."""
     names = [name for name, array in zip(inputs, program.inputs, strict=True) for _ in array.flat]
-    num_carried = sum(name in carried for name in names)
 
-    def repeated(*arrays):
+    def step(*arrays):
         elements = program.split(arrays)
-        held = [None if name in carried else x for name, x in zip(names, elements, strict=True)]
+        return tuple(program.join(_repeat(lambda x: program.run(x, stages), names, carried, num_substeps, elements)))
 
-        def substep(state, _):
-            state = iter(state)
-            results = program.run([next(state) if x is None else x for x in held], stages)
-            return tuple(results[:num_carried]), tuple(results[num_carried:])
-
-        state = tuple(x for name, x in zip(names, elements, strict=True) if name in carried)
-        return tuple(program.join(_loop(substep, state, num_substeps)))
-
-    return repeated
+    return step
 
 
-def _loop(substep: Callable, state: tuple, length: int) -> tuple:
-    """The last state and the last of what else a substep gives."""
+def _repeat(function: Callable[[list], Sequence], names, carried, length: int, values: Sequence) -> tuple:
+    """`function` of the named values, `length` times with the carried ones fed back: the last of all its results.
+
+    The results begin with the carried ones, in the values' order.
+    """
+    is_carried = [name in carried for name in names]
+    num_carried = sum(is_carried)
+
+    def substep(state, _):
+        state = iter(state)
+        results = function([next(state) if fed_back else x for fed_back, x in zip(is_carried, values, strict=True)])
+        return tuple(results[:num_carried]), tuple(results[num_carried:])
+
+    state = tuple(x for fed_back, x in zip(is_carried, values, strict=True) if fed_back)
     if length == 1:
         state, others = substep(state, None)
         return (*state, *others)

@@ -42,8 +42,8 @@ class TD(Learning):
 class Reinforce(Learning):
     """REINFORCE: complete episodes, Monte Carlo returns."""
 
-    baseline: str = option("value", "what is subtracted from the return", choices=BASELINES)
-    returns: str = option("to_go", "from each step on, or of the whole episode", choices=RETURNS)
+    baseline: str = option("value", "what is subtracted from the return", choices=tuple(BASELINES))
+    returns: str = option("to_go", "from each step on, or of the whole episode", choices=tuple(RETURNS))
     discounted: bool = option(False, "advantages times gamma^t, as the gradient of the objective has them")
 
 
