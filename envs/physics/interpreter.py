@@ -202,9 +202,9 @@ def _call_high(operands, wanted, *, _prim):
     return evaluate(closed.jaxpr, closed.consts, operands, wanted)
 
 
-def _scan(operands, wanted, *, jaxpr, length, reverse, num_consts, num_carry, **_):
-    consts, carry = operands[:num_consts], operands[num_consts : num_consts + num_carry]
-    xs = operands[num_consts + num_carry :]
+def _scan(operands, wanted, *, jaxpr, length, reverse, **groups):
+    consts, carry, xs = _scan_operands(operands, **groups)
+    num_carry = len(carry)
     rows = []
     for i in reversed(range(length)) if reverse else range(length):
         results = evaluate(jaxpr.jaxpr, jaxpr.consts, [*consts, *carry, *(x[i, ...] for x in xs)])
@@ -215,6 +215,13 @@ def _scan(operands, wanted, *, jaxpr, length, reverse, num_consts, num_carry, **
         np.stack(column if is_numeric(*column) else list(map(as_objects, column))) for column in zip(*rows, strict=True)
     ] or [np.zeros((0, *var.aval.shape), var.aval.dtype) for var in jaxpr.jaxpr.outvars[num_carry:]]
     return [*carry, *stacked]
+
+
+def _scan_operands(operands, *, num_consts=None, num_carry=None, ft_in=None, **_):
+    """(consts, carry, xs): by their numbers, or from jax 0.12 on by a tree that has them as its branches."""
+    if ft_in is not None:
+        return map(list, ft_in.update(operands).unpack())
+    return operands[:num_consts], operands[num_consts : num_consts + num_carry], operands[num_consts + num_carry :]
 
 
 def _cond(operands, wanted, *, branches, **_):
