@@ -104,7 +104,7 @@ class Arm(MjxEnv):
     def __init__(self, config: ArmConfig = ArmConfig()):
         self.config = config
         self.lengths = (config.upper_length, config.fore_length)
-        super().__init__(_spec(config), config.num_substeps, config.physics)
+        super().__init__(_spec(config), config.num_substeps, config.physics, check=False)
 
     def reset(self, rng: jax.Array) -> State:
         """q ~ U(-pi, pi)^2 at rest, goal uniform over the ring's area."""

@@ -18,7 +18,7 @@ import jax
 import jax.numpy as jnp
 from flax import struct
 
-from envs.physics import compile_model, compile_step
+from envs.physics import check_once, compile_model, compile_step
 
 ASSETS = Path(__file__).parent / "assets"
 
@@ -51,10 +51,14 @@ class MjxEnv:
       spec: the MuJoCo specification, already edited to the environment's options.
       num_substeps: physics steps between two actions.
       physics: how they are computed: "scalar" (equations made of MJX's step) or "mjx" (that step itself).
+      check: log what MJX does otherwise than C MuJoCo (`envs.physics.check_model`), which takes a second or more. The
+        shipped environments leave it to the tests.
     """
 
-    def __init__(self, spec: Any, num_substeps: int = 1, physics: str = "scalar"):
+    def __init__(self, spec: Any, num_substeps: int = 1, physics: str = "scalar", check: bool = True):
         self.model = compile_model(spec)
+        if check:
+            check_once(self.model)
         self.dt = self.model.opt.timestep * num_substeps
         self.physics_step = compile_step(self.model, num_substeps, physics=physics)
 

@@ -12,8 +12,16 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import envs
-from envs.base import ASSETS
-from envs.physics import MujocoModelError, check_model, compile_model, compile_step, ignored_features, load_spec
+from envs.base import ASSETS, MjxEnv
+from envs.physics import (
+    MujocoModelError,
+    check_model,
+    compile_model,
+    compile_step,
+    ignored_features,
+    load_model,
+    load_spec,
+)
 from envs.physics.step import single_step
 
 STATE = ("qpos", "qvel")
@@ -304,3 +312,20 @@ def test_models_that_mjx_steps_otherwise_fail_the_check():
     left_out, difference = check_model(model)
     assert "damping of actuators" in left_out
     assert "differs from C MuJoCo" in difference
+
+
+def test_a_model_is_checked_when_it_is_first_loaded(tmp_path, caplog):
+    """By `load_model` and by an environment over it: once in a process, whichever comes first."""
+    path = tmp_path / "crane.xml"
+    motor = '<motor joint="pole" damping="3"/>'
+    path.write_text(models.chain(models.pole(), motor).replace("<mujoco", '<mujoco model="crane"'))
+    load_model(path)
+    left_out, difference = (record.getMessage() for record in caplog.records)
+    assert left_out == "crane: MJX leaves out: damping of actuators"
+    assert difference.startswith("crane: ")
+    assert "differs from C MuJoCo" in difference
+    MjxEnv(load_spec(path))
+    assert len(caplog.records) == 2
+    path.write_text(path.read_text().replace('damping="3"', 'damping="4"'))
+    MjxEnv(load_spec(path))
+    assert len(caplog.records) == 4

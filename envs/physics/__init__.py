@@ -1,6 +1,6 @@
 """What moves the environments: one step of a MuJoCo model as a function of the few arrays that change."""
 
-from envs.physics.check import check_model
+from envs.physics.check import check_model, check_once, load_model
 from envs.physics.interpreter import scalarize
 from envs.physics.models import MujocoModelError, compile_model, ignored_features, load_spec
 from envs.physics.rules import UnsupportedPrimitive
@@ -11,9 +11,11 @@ __all__ = [
     "MujocoModelError",
     "UnsupportedPrimitive",
     "check_model",
+    "check_once",
     "compile_model",
     "compile_step",
     "ignored_features",
+    "load_model",
     "load_spec",
     "scalarize",
 ]

@@ -2,17 +2,48 @@
 
 from __future__ import annotations
 
+import hashlib
+import logging
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from envs.physics.models import ignored_features
+from envs.physics.models import compile_model, ignored_features, load_spec, model_name
 from envs.physics.step import compile_step
 
 if TYPE_CHECKING:
     import mujoco
+
+logger = logging.getLogger(__name__)
+
+_checked: set[bytes] = set()  # digests of the models that `check_once` has seen
+
+
+def load_model(path: str | Path) -> mujoco.MjModel:
+    """The compiled model in an MJCF file, checked by `check_once`.
+
+    Raises:
+      MujocoModelError: the file is missing or is not MJCF, or MJX cannot step the model.
+    """
+    model = compile_model(load_spec(path))
+    check_once(model)
+    return model
+
+
+def check_once(model: mujoco.MjModel) -> None:
+    """Logs what `check_model` finds, one warning each, when a model is met for the first time in this process."""
+    import mujoco
+
+    content = np.empty(mujoco.mj_sizeModel(model), np.uint8)
+    mujoco.mj_saveModel(model, None, content)
+    digest = hashlib.sha256(content).digest()
+    if digest not in _checked:
+        _checked.add(digest)
+        for line in check_model(model):
+            logger.warning("%s: %s", model_name(model), line)
 
 
 def check_model(model: mujoco.MjModel, num_steps: int = 50, tolerance: float = 1e-3) -> list[str]:
