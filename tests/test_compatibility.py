@@ -1,9 +1,9 @@
 """Releases of jaxlib that compute wrong numbers are refused."""
 
 import jax
-import jax.numpy as jnp
 import jaxlib
 import pytest
+from wrong_sums import wrong_sums
 
 from jaxpg.compatibility import WRONG_SUMS, check_jaxlib
 from jaxpg.run.config import compose
@@ -17,15 +17,8 @@ def test_releases_with_wrong_sums_are_refused_by_name(version):
         check_jaxlib(version)
 
 
-def wrong_sums(calls=40):
-    """In how many of the calls a sum of 2 * 1024 * 1024 ones is not that."""
-    total = jax.jit(lambda a: jnp.sum(jnp.broadcast_to(a, (2, 1024, 1024))))
-    ones = jnp.ones((1024, 1024))
-    return sum(float(total(ones)) != 2 * 1024 * 1024 for _ in range(calls))
-
-
 def test_the_installed_release_sums_right_or_is_refused():
-    """Where a release of `WRONG_SUMS` is installed, `python tests/test_compatibility.py` reproduces the wrong sums."""
+    """Where a release of `WRONG_SUMS` is installed, `python tests/wrong_sums.py` reproduces them."""
     check_jaxlib(jaxlib.__version__)
     assert wrong_sums() == 0
 
@@ -41,7 +34,3 @@ def test_the_training_program_makes_no_lapack_call(environment):
     with jax.debug_key_reuse(False):  # see test_vmapped_seeds_are_single_seeds
         compiled = train.lower(agent_keys(config)).compile().as_text()
     assert 'custom_call_target="lapack' not in compiled
-
-
-if __name__ == "__main__":
-    print(f"jaxlib {jaxlib.__version__}: {wrong_sums()} of 40 sums are wrong")
