@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 # Releases whose CPU reductions are wrong: jit(lambda a: jnp.sum(jnp.broadcast_to(a, (2, 1024, 1024)))) of ones differs
-# from 2097152 in about half of the calls. `tests/test_compatibility.py` reproduces it where one of them is installed.
+# from 2097152 in about half of the calls. `python tests/wrong_sums.py` reproduces it where one of them is installed.
 WRONG_SUMS = ("0.10.2",)
 # Releases that wait for ever when batched LAPACK calls fill XLA's thread pool; the last one is 0.11.0. The shipped
 # environments make no such calls; brax's do.
