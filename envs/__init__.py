@@ -11,7 +11,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple
 
-from envs import arm, brax_env, pendulum
+from envs import arm, brax_env, pendulum, quadratic
 from envs.options import OptionError, build, unknown
 
 
@@ -21,7 +21,8 @@ class Entry(NamedTuple):
     Attributes:
       config: dataclass of its options; has `episode_length`.
       build: `build(config) -> env`.
-      training: tuned training values by algorithm, under the training command's option names.
+      training: tuned training values by algorithm, under the training command's option names; `network` among them
+        chooses the network, and options of another network than the chosen one do not count.
     """
 
     config: type
@@ -32,6 +33,7 @@ class Entry(NamedTuple):
 REGISTRY: dict[str, Entry] = {
     "pendulum": Entry(pendulum.PendulumConfig, pendulum.Pendulum, pendulum.TRAINING),
     "arm": Entry(arm.ArmConfig, arm.Arm, arm.TRAINING),
+    "quadratic": Entry(quadratic.QuadraticConfig, quadratic.make, quadratic.TRAINING),
     "brax": Entry(brax_env.BraxConfig, brax_env.make, brax_env.TRAINING),
 }
 

@@ -8,6 +8,9 @@ for T steps, with discount gamma. Under the policy the value is quadratic in the
 c_t), and comes from a recursion backwards in time; the states are Gaussian, and their moments come from a recursion
 forwards. Both together give J and its gradient. All of this is plain numpy in float64: it is what estimators are tested
 against.
+
+`LinearQuadratic` is the problem as an environment: the state is observed, actions are taken as they come, without
+limits, and nothing ever terminates.
 """
 
 from __future__ import annotations
@@ -15,7 +18,39 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import NamedTuple
 
+import jax
+import jax.numpy as jnp
 import numpy as np
+
+from envs.base import State, initial_state
+from envs.options import option
+
+
+@dataclass(frozen=True)
+class QuadraticConfig:
+    """Options of the linear-quadratic problem; the defaults are the lesson's example, section 8.3.
+
+    With more than one variable each pulls the one before it: A = I + 0.1 N, with N = 1 above the diagonal.
+    """
+
+    state_size: int = option(1, "variables of the state, each with an action of its own", at_least=1, at_most=100)
+    start: float = option(0.5, "mean of every variable at the start")
+    start_spread: float = option(0.0, "standard deviation of every variable at the start", at_least=0)
+    noise: float = option(0.0, "standard deviation of the noise on the state in each step", at_least=0)
+    action_cost: float = option(0.01, "weight of the squared action", above=0)
+    episode_length: int = option(50, "steps until the time limit", at_least=1)
+
+
+TRAINING = {
+    name: {
+        "network": "linear",
+        "network.features": "identity",
+        "network.sigma_is": "fixed",
+        "network.squash": False,
+        "algo.normalize_observations": False,
+    }
+    for name in ("td", "reinforce", "online")
+}
 
 
 @dataclass(frozen=True)
@@ -62,19 +97,61 @@ class Quadratic(NamedTuple):
         return -(np.einsum("...i,ij,...j", x, self.P, x) + 2 * x @ self.p + self.c)
 
 
-def toy(horizon: int = 50, discount: float = 0.99) -> Problem:
-    """The lesson's example, section 8.3: s' = s + 0.1 a, r = -(s'^2 + 0.01 a^2), from s_0 = 0.5."""
+def chain(config: QuadraticConfig, discount: float = 0.99) -> Problem:
+    """The problem that the environment's options describe; by default the lesson's."""
+    eye = np.eye(config.state_size)
     return Problem(
-        A=np.eye(1),
-        B=np.array([[0.1]]),
-        Q=np.eye(1),
-        R=np.array([[0.01]]),
-        W=np.zeros((1, 1)),
-        initial_mean=np.array([0.5]),
-        initial_covariance=np.zeros((1, 1)),
-        horizon=horizon,
+        A=eye + 0.1 * np.eye(config.state_size, k=1),
+        B=0.1 * eye,
+        Q=eye,
+        R=config.action_cost * eye,
+        W=config.noise**2 * eye,
+        initial_mean=config.start * np.ones(config.state_size),
+        initial_covariance=config.start_spread**2 * eye,
+        horizon=config.episode_length,
         discount=discount,
     )
+
+
+class LinearQuadratic:
+    """A `Problem` as an environment of brax's interface; its horizon is the caller's time limit.
+
+    Args:
+      problem: what to play. Its noise is drawn from a key that the state carries.
+    """
+
+    def __init__(self, problem: Problem):
+        self.problem = problem
+        self.observation_size, self.action_size = problem.B.shape
+        self._spread = _root(problem.initial_covariance)
+        self._noise = _root(problem.W)
+
+    def reset(self, rng: jax.Array) -> State:
+        """s_0 ~ N(m_0, S_0)."""
+        key_start, key_noise = jax.random.split(rng)
+        start = jnp.asarray(self.problem.initial_mean, float)
+        s = start + self._spread @ jax.random.normal(key_start, start.shape, start.dtype)
+        return initial_state(jax.random.key_data(key_noise), s)
+
+    def step(self, state: State, action: jax.Array) -> State:
+        """s' = A s + B a + w,  r = -(s'' Q s' + a' R a)."""
+        problem, s = self.problem, state.obs
+        key, key_noise = jax.random.split(jax.random.wrap_key_data(state.pipeline_state))
+        noise = self._noise @ jax.random.normal(key_noise, s.shape, s.dtype)
+        following = problem.A @ s + problem.B @ action + noise
+        cost = following @ problem.Q @ following + action @ problem.R @ action
+        return state.replace(pipeline_state=jax.random.key_data(key), obs=following, reward=-cost)
+
+
+def _root(covariance: np.ndarray) -> np.ndarray:
+    """A symmetric matrix whose square is the covariance, which may be singular."""
+    squares, axes = np.linalg.eigh(covariance)
+    return axes * np.sqrt(np.maximum(squares, 0)) @ axes.T
+
+
+def make(config: QuadraticConfig) -> LinearQuadratic:
+    """The environment that the options describe."""
+    return LinearQuadratic(chain(config))
 
 
 def values(problem: Problem, policy: Policy) -> list[Quadratic]:
@@ -188,6 +265,30 @@ def gradient(
         dk = dk + factor * (slope @ mean + offset)
         dlog_sigma = dlog_sigma + factor * sigma**2 * np.trace(P[n:, n:])
     return Policy(dK, dk, float(dlog_sigma))
+
+
+def best_policy(problem: Problem, sigma: float) -> Policy:
+    """The K and k of the largest J among the policies that are the same at every step, with this sigma.
+
+    Found by following the gradient in closed form; J is not concave in K, but has no other stationary point that is
+    stable (Fazel et al., arXiv 1801.05039, for long horizons). Raises RuntimeError where the search does not end.
+    """
+    import scipy.optimize  # slow to import, and seldom needed
+
+    n, m = problem.B.shape
+
+    def unpack(x):
+        return Policy(x[: m * n].reshape(m, n), x[m * n :], sigma)
+
+    def loss(x):
+        slope = gradient(problem, unpack(x))
+        return -objective(problem, unpack(x)), -np.concatenate([slope.K.ravel(), slope.k])
+
+    start = np.concatenate([riccati_gains(problem)[0].ravel(), np.zeros(m)])
+    found = scipy.optimize.minimize(loss, start, jac=True, method="BFGS", options={"gtol": 1e-7})
+    if not found.success:
+        raise RuntimeError(f"no best policy found: {found.message}")
+    return unpack(found.x)
 
 
 def riccati_gains(problem: Problem) -> list[np.ndarray]:

@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import optax
 
 from jaxpg import baselines, estimators, normalization
-from jaxpg.distributions import gaussian_entropy, gaussian_sample, squashed_gaussian_log_prob
+from jaxpg.distributions import gaussian_sample
 from jaxpg.estimators import Estimate
 from jaxpg.losses import entropy_loss, policy_gradient_loss, value_loss
 from jaxpg.networks import Networks
@@ -139,7 +139,7 @@ def actor_critic(
       optimizer: of `{"actor": ..., "critic": ...}`.
       method: `td(...)` or `reinforce(...)`.
       reward_scale: factor on the rewards that the estimator and the critic see; reported returns are not scaled.
-      entropy_coef: weight of the entropy of u's Gaussian.
+      entropy_coef: weight of the policy's entropy; of a squashed one estimated by its samples.
       normalize_observations: feed the networks (s - mean) / std with running statistics, updated after each step.
       normalize_advantages: mean 0 and standard deviation 1 over the batch.
 
@@ -200,13 +200,13 @@ def actor_critic_loss(
         weight = method.weight(transition)
         scaled = transition._replace(reward=reward_scale * transition.reward)
         mean, log_std = networks.policy(params["actor"], obs)
-        score = jax.lax.stop_gradient((transition.pre_tanh - mean) * jnp.exp(-2 * log_std))
+        score = jax.lax.stop_gradient((transition.u - mean) * jnp.exp(-2 * log_std))
         squared_score = jnp.sum(jnp.square(score), axis=-1)
         advantage, target = method.estimate(scaled, weight, value, next_value, squared_score)
         if normalize_advantages:
             advantage = estimators.normalize_advantages(advantage, weight)
-        log_prob = squashed_gaussian_log_prob(transition.pre_tanh, mean, log_std)
-        entropy = jnp.broadcast_to(gaussian_entropy(log_std), weight.shape)
+        log_prob = networks.distribution.log_prob(transition.u, mean, log_std)
+        entropy = networks.distribution.entropy(transition.u, mean, log_std)
         losses = {
             "policy_loss": policy_gradient_loss(log_prob, advantage, weight),
             "value_loss": value_loss(value, target, weight),
@@ -219,20 +219,21 @@ def actor_critic_loss(
 
 
 def sampling_policy(networks: Networks, params: PyTree, normalizer: PyTree) -> PolicyFn:
-    """`policy_fn(obs, key) -> u`, drawn from the Gaussian."""
+    """`policy_fn(obs, key) -> (u, action)`, drawn from the Gaussian."""
 
     def policy_fn(obs, key):
         mean, log_std = networks.policy(params["actor"], normalization.normalize(normalizer, obs))
-        return gaussian_sample(key, mean, log_std)
+        u = gaussian_sample(key, mean, log_std)
+        return u, networks.distribution.action(u)
 
     return policy_fn
 
 
 def deterministic_policy(networks: Networks, params: PyTree, normalizer: PyTree) -> Callable[[jax.Array], jax.Array]:
-    """`policy(obs) -> action` in [-1, 1]: tanh of the Gaussian's mean."""
+    """`policy(obs) -> action`: that of the Gaussian's mean."""
 
     def policy(obs):
         mean, _ = networks.policy(params["actor"], normalization.normalize(normalizer, obs))
-        return jnp.tanh(mean)
+        return networks.distribution.action(mean)
 
     return policy

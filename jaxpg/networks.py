@@ -9,9 +9,12 @@ import jax
 import jax.numpy as jnp
 from flax import linen as nn
 
+from jaxpg.distributions import SQUASHED_GAUSSIAN, Distribution
+from jaxpg.features import FEATURES
 from jaxpg.types import PyTree
 
 ACTIVATIONS = {"tanh": jnp.tanh, "relu": jax.nn.relu, "elu": jax.nn.elu, "swish": jax.nn.swish}
+SIGMAS = ("fixed", "learned", "state")  # a constant, a parameter, a function of the state
 
 
 class Networks(NamedTuple):
@@ -20,13 +23,15 @@ class Networks(NamedTuple):
     Attributes:
       init: `init(key) -> {"actor": ..., "critic": ...}`.
       policy: `policy(params["actor"], obs) -> (mean, log_std)` of the Gaussian over u, `[..., action_size]` and
-        `[action_size]`.
+        `[action_size]`, or both `[..., action_size]` where sigma depends on the state.
       value: `value(params["critic"], obs) -> V(s)`, `[...]`.
+      distribution: the actions made of u, and their densities.
     """
 
     init: Callable[[jax.Array], PyTree]
     policy: Callable[[PyTree, jax.Array], tuple[jax.Array, jax.Array]]
     value: Callable[[PyTree, jax.Array], jax.Array]
+    distribution: Distribution
 
 
 class MLP(nn.Module):
@@ -78,19 +83,30 @@ def _orthonormalize(a: jax.Array) -> jax.Array:
 
 
 class GaussianActor(nn.Module):
-    """u ~ N(mu(s), sigma^2): an MLP for the mean, one sigma for each action, fixed or learned."""
+    """u ~ N(mu(s), sigma^2), with an MLP for the mean and one sigma for each action.
+
+    Attributes:
+      widths, action_size, activation: of the MLP; without hidden layers the mean is linear.
+      output_gain: of the mean's last layer; 0 begins with the mean 0 everywhere.
+      initial_std: sigma at the beginning; with sigma "state" it is so where the network's output is 0.
+      sigma: a name in `SIGMAS`.
+    """
 
     widths: Sequence[int]
     action_size: int
     activation: Callable[[jax.Array], jax.Array]
+    output_gain: float
     initial_std: float
-    learn_std: bool
+    sigma: str
 
     @nn.compact
     def __call__(self, obs: jax.Array) -> tuple[jax.Array, jax.Array]:
-        mean = MLP(self.widths, self.action_size, output_gain=0.01, activation=self.activation)(obs)
+        mean = MLP(self.widths, self.action_size, self.output_gain, self.activation)(obs)
         initial = nn.initializers.constant(jnp.log(self.initial_std))
-        if self.learn_std:
+        if self.sigma == "state":
+            offset = MLP(self.widths, self.action_size, self.output_gain, self.activation)(obs)
+            return mean, initial(None, (self.action_size,)) + offset
+        if self.sigma == "learned":
             return mean, self.param("log_std", initial, (self.action_size,))
         return mean, initial(None, (self.action_size,))
 
@@ -101,7 +117,8 @@ def mlp_networks(
     widths: Sequence[int] = (64, 64),
     activation: str = "tanh",
     initial_std: float = 1.0,
-    learn_std: bool = True,
+    sigma: str = "learned",
+    distribution: Distribution = SQUASHED_GAUSSIAN,
 ) -> Networks:
     """Separate MLPs for the mean of the policy and for the value.
 
@@ -109,8 +126,9 @@ def mlp_networks(
       observation_size, action_size: of the environment.
       widths: hidden units by layer, the same for actor and critic.
       activation: a name in `ACTIVATIONS`.
-      initial_std: sigma of the Gaussian over u, before squashing; positive.
-      learn_std: whether sigma is a parameter or stays as it is.
+      initial_std: sigma of the Gaussian over u; positive.
+      sigma: a name in `SIGMAS`: as it is, a parameter, or the output of an MLP of its own.
+      distribution: what is made of u.
 
     >>> networks = mlp_networks(observation_size=3, action_size=1)
     >>> params = networks.init(jax.random.key(0))
@@ -118,12 +136,52 @@ def mlp_networks(
     >>> mean.shape, log_std.shape, networks.value(params["critic"], jnp.zeros((5, 3))).shape
     ((5, 1), (1,), (5,))
     """
-    actor = GaussianActor(tuple(widths), action_size, ACTIVATIONS[activation], initial_std, learn_std)
-    critic = MLP(tuple(widths), 1, output_gain=1.0, activation=ACTIVATIONS[activation])
+    activation = ACTIVATIONS[activation]
+    actor = GaussianActor(tuple(widths), action_size, activation, 0.01, initial_std, sigma)
+    critic = MLP(tuple(widths), 1, output_gain=1.0, activation=activation)
+    return _networks(actor, critic, lambda obs: obs, observation_size, distribution)
+
+
+def linear_networks(
+    observation_size: int,
+    action_size: int,
+    features: str = "identity",
+    order: int = 1,
+    initial_std: float = 1.0,
+    sigma: str = "learned",
+    distribution: Distribution = SQUASHED_GAUSSIAN,
+) -> Networks:
+    """Mean and value linear in fixed features of the observation, 0 at the beginning.
+
+        mu(s) = W phi(s) + b,    V(s) = w' phi(s) + c
+
+    Args:
+      observation_size, action_size: of the environment.
+      features, order: phi, a name in `jaxpg.features.FEATURES` and its order.
+      initial_std, sigma, distribution: as in `mlp_networks`; with sigma "state", log sigma is linear in phi too.
+
+    Source: the lesson, section 7.
+
+    >>> networks = linear_networks(observation_size=2, action_size=1, features="polynomial", order=2)
+    >>> jax.tree.map(jnp.shape, networks.init(jax.random.key(0))["critic"])
+    {'params': {'Dense_0': {'bias': (1,), 'kernel': (5, 1)}}}
+    """
+    actor = GaussianActor((), action_size, jnp.tanh, 0.0, initial_std, sigma)
+    critic = MLP((), 1, output_gain=0.0, activation=jnp.tanh)
+    return _networks(actor, critic, lambda obs: FEATURES[features](obs, order), observation_size, distribution)
+
+
+def _networks(actor, critic, phi, observation_size: int, distribution: Distribution) -> Networks:
+    """The flax modules, applied to phi(s), as pure functions."""
 
     def init(key):
         key_actor, key_critic = jax.random.split(key)
-        obs = jnp.zeros(observation_size)
-        return {"actor": actor.init(key_actor, obs), "critic": critic.init(key_critic, obs)}
+        x = phi(jnp.zeros(observation_size))
+        return {"actor": actor.init(key_actor, x), "critic": critic.init(key_critic, x)}
 
-    return Networks(init, actor.apply, lambda params, obs: critic.apply(params, obs)[..., 0])
+    return Networks(
+        init,
+        lambda params, obs: actor.apply(params, phi(obs)),
+        lambda params, obs: critic.apply(params, phi(obs))[..., 0],
+        distribution,
+    )

@@ -6,12 +6,11 @@ from collections.abc import Callable
 from typing import Any
 
 import jax
-import jax.numpy as jnp
 
 from jaxpg.types import Transition
 
-# obs [N, observation_size], key -> u [N, action_size]
-PolicyFn = Callable[[jax.Array, jax.Array], jax.Array]
+# obs [N, observation_size], key -> (u, action), both [N, action_size]
+PolicyFn = Callable[[jax.Array, jax.Array], tuple[jax.Array, jax.Array]]
 
 
 def rollout(
@@ -19,10 +18,10 @@ def rollout(
 ) -> tuple[Any, Transition]:
     """`length` steps of all environments under one policy.
 
-        u_t ~ policy_fn(s_t),    s_{t+1}, r_t ~ env_step(s_t, tanh(u_t))
+        u_t, a_t ~ policy_fn(s_t),    s_{t+1}, r_t ~ env_step(s_t, a_t)
 
     Args:
-      policy_fn: `policy_fn(obs, key) -> u`, the action before squashing.
+      policy_fn: `policy_fn(obs, key) -> (u, action)`, what the Gaussian drew and what the environment gets.
       env_step: `VectorEnv.step`.
       env_state: where to start.
       key: random key of the whole rollout.
@@ -35,8 +34,8 @@ def rollout(
     def step(env_state, key):
         key_policy, key_env = jax.random.split(key)
         obs = env_state.obs
-        pre_tanh = policy_fn(obs, key_policy)
-        env_state, outcome = env_step(env_state, jnp.tanh(pre_tanh), key_env)
-        return env_state, Transition(obs=obs, pre_tanh=pre_tanh, **outcome._asdict())
+        u, action = policy_fn(obs, key_policy)
+        env_state, outcome = env_step(env_state, action, key_env)
+        return env_state, Transition(obs=obs, u=u, **outcome._asdict())
 
     return jax.lax.scan(step, env_state, jax.random.split(key, length))

@@ -16,7 +16,7 @@ class Transition(NamedTuple):
 
     Attributes:
       obs: s_t, `[T, N, observation_size]`.
-      pre_tanh: u_t, the action before squashing, `[T, N, action_size]`; the environment took tanh(u_t).
+      u: u_t, what the policy's Gaussian drew, `[T, N, action_size]`; the environment took the action made of it.
       reward: r_t, `[T, N]`.
       terminated: 1.0 where the step ended in a terminal state, whose value is 0, `[T, N]`.
       truncated: 1.0 where a time limit cut the episode after the step, `[T, N]`; never together with `terminated`.
@@ -26,7 +26,7 @@ class Transition(NamedTuple):
     """
 
     obs: jax.Array
-    pre_tanh: jax.Array
+    u: jax.Array
     reward: jax.Array
     terminated: jax.Array
     truncated: jax.Array

@@ -20,7 +20,7 @@ MISTAKES = {
     "option of another environment": (["env.goal_min=0.3"], "unknown option 'env.goal_min'"),
     "word for a number": (["num_envs=many"], "num_envs=many: expected a whole number"),
     "fraction for a count": (["num_envs=2.5"], "num_envs=2.5: expected a whole number"),
-    "number for a switch": (["network.learn_sigma=1"], "network.learn_sigma=1: expected true or false"),
+    "number for a switch": (["network.squash=1"], "network.squash=1: expected true or false"),
     "number for a list": (["network.widths=64"], "network.widths=64: expected a list such as [64,64]"),
     "unknown choice": (["network.activation=gelu"], "must be tanh or relu or elu or swish"),
     "zero environments": (["num_envs=0"], "num_envs=0: must be at least 1"),

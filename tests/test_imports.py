@@ -19,11 +19,12 @@ LEVELS = [
         "estimators",
         "losses",
         "distributions",
+        "features",
         "normalization",
         "compatibility",
     },
     {"networks", "vector_env"},
-    {"rollout", "actor_critic", "training", "evaluation"},
+    {"rollout", "actor_critic", "online", "training", "evaluation"},
     {"run", "train", "evaluate"},
 ]
 FOREIGN = {0: {"jax"}, 1: {"jax", "flax"}, 2: {"jax", "optax"}}

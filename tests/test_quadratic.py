@@ -9,13 +9,14 @@ from hypothesis import strategies as st
 from envs.quadratic import (
     Policy,
     Problem,
+    QuadraticConfig,
     action_value,
+    chain,
     gradient,
     lambda_targets,
     objective,
     riccati_gains,
     state_moments,
-    toy,
     values,
 )
 
@@ -149,8 +150,8 @@ def test_riccati_gains_are_the_best():
 def test_the_lessons_example():
     """Without control the state stays at 0.5 and each step costs 0.25, besides the exploration's cost."""
     idle = Policy(np.zeros((1, 1)), np.zeros(1), 0.0)
-    np.testing.assert_allclose(objective(toy(horizon=50, discount=1.0), idle), -50 * 0.25)
-    gains = [K.item() for K in riccati_gains(toy())]
+    np.testing.assert_allclose(objective(chain(QuadraticConfig(), discount=1.0), idle), -50 * 0.25)
+    gains = [K.item() for K in riccati_gains(chain(QuadraticConfig()))]
     assert -10 < min(gains) < max(gains) < 0
     assert gains[-1] == pytest.approx(-0.1 / (0.1**2 + 0.01))
 

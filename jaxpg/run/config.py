@@ -97,10 +97,19 @@ def compose(arguments: Sequence[str]) -> Config:
       OptionError, UserError: every unknown name, wrong type and value out of range; or text that is no override.
     """
     given = parse(arguments)
-    choices = DEFAULT_CHOICES | {group: value for group, value in given.items() if group in GROUPS}
+    chosen = {group: value for group, value in given.items() if group in GROUPS}
+    tuned = _tuned(DEFAULT_CHOICES | chosen)
+    choices = DEFAULT_CHOICES | {group: value for group, value in tuned.items() if group in GROUPS} | chosen
     _check_names(given, choices)
-    tuned = envs.find(choices["env"]).training.get(choices["algo"], {})
-    return from_dict(_hydra_compose(choices, tuned | {n: v for n, v in given.items() if n not in GROUPS}))
+    fields = option_fields(choices)
+    values = {name: value for name, value in (tuned | given).items() if name in fields}
+    return from_dict(_hydra_compose(choices, values))
+
+
+def _tuned(choices: Mapping[str, Any]) -> Mapping[str, Any]:
+    """What the environment's registry entry says for the algorithm; nothing where there is no such environment."""
+    entry = envs.REGISTRY.get(choices["env"])
+    return entry.training.get(choices["algo"], {}) if entry else {}
 
 
 def parse(arguments: Sequence[str]) -> dict[str, Any]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any, NamedTuple
@@ -12,8 +13,10 @@ import optax
 
 import envs
 from jaxpg.actor_critic import Method, actor_critic, deterministic_policy, reinforce, td
+from jaxpg.distributions import GAUSSIAN, SQUASHED_GAUSSIAN
 from jaxpg.evaluation import Episodes, evaluate
-from jaxpg.networks import Networks, mlp_networks
+from jaxpg.networks import Networks, linear_networks, mlp_networks
+from jaxpg.online import online_actor_critic
 from jaxpg.run.config import Config
 from jaxpg.run.state import Policy, RunState, current_policy, start
 from jaxpg.training import initial_state, train_scan
@@ -91,17 +94,27 @@ def make_env(config: Config) -> Any:
 
 def make_networks(config: Config, env: Any) -> Networks:
     network = config.network
-    return mlp_networks(
-        env.observation_size, env.action_size, network.widths, network.activation, network.sigma, network.learn_sigma
-    )
+    sizes = env.observation_size, env.action_size
+    policy = {
+        "initial_std": network.sigma,
+        "sigma": network.sigma_is,
+        "distribution": SQUASHED_GAUSSIAN if network.squash else GAUSSIAN,
+    }
+    if config.choices["network"] == "linear":
+        return linear_networks(*sizes, network.features, network.order, **policy)
+    return mlp_networks(*sizes, network.widths, network.activation, **policy)
 
 
 def make_algorithm(config: Config, env: Any) -> Algorithm:
     """One agent's algorithm, as pure functions."""
     algo, run = config.algo, config.run
+    batch = vectorize(env, run.num_envs, config.env.episode_length)
+    networks = make_networks(config, env)
+    if config.choices["algo"] == "online":
+        return online_actor_critic(batch, networks, num_steps=run.num_steps, **dataclasses.asdict(algo))
     return actor_critic(
-        vectorize(env, run.num_envs, config.env.episode_length),
-        make_networks(config, env),
+        batch,
+        networks,
         make_optimizer(config),
         make_method(config),
         reward_scale=algo.reward_scale,

@@ -11,7 +11,8 @@ from dataclasses import dataclass
 import envs
 from envs.options import option
 from jaxpg.actor_critic import BASELINES, ESTIMATORS, RETURNS
-from jaxpg.networks import ACTIVATIONS
+from jaxpg.features import FEATURES
+from jaxpg.networks import ACTIVATIONS, SIGMAS
 
 
 @dataclass(frozen=True)
@@ -48,13 +49,44 @@ class Reinforce(Learning):
 
 
 @dataclass(frozen=True)
-class MLP:
+class Online:
+    """Per-step actor-critic: after every step, plain steps along eligibility traces."""
+
+    gamma: float = option(0.99, "discount", at_least=0, at_most=1)
+    lambda_actor: float = option(
+        0.9, "decay of the actor's trace; 0 is the gradient of the step alone", at_least=0, at_most=1
+    )
+    lambda_critic: float = option(0.9, "decay of the critic's trace", at_least=0, at_most=1)
+    actor_lr: float = option(0.001, "step size of the actor", above=0)
+    critic_lr: float = option(0.005, "step size of the critic", above=0)
+    reward_scale: float = option(1.0, "factor on the rewards that are learned from", above=0)
+    discounted: bool = option(False, "the actor's gradient times gamma^t")
+    normalize_observations: bool = option(True, "observations with running mean 0 and deviation 1")
+
+
+@dataclass(frozen=True)
+class Gaussian:
+    """Options of the Gaussian policy that all networks share."""
+
+    sigma: float = option(0.5, "standard deviation of the policy at the beginning, before tanh", above=0)
+    sigma_is: str = option("learned", "how it goes on: fixed, a parameter, or a function of the state", choices=SIGMAS)
+    squash: bool = option(True, "actions tanh(u), within the limits; else u itself")
+
+
+@dataclass(frozen=True)
+class MLP(Gaussian):
     """Separate multilayer perceptrons for actor and critic."""
 
     widths: list[int] = option([64, 64], "hidden units by layer", at_least=1)
     activation: str = option("tanh", "activation of the hidden layers", choices=tuple(ACTIVATIONS))
-    sigma: float = option(0.5, "initial standard deviation of the policy, before tanh", above=0)
-    learn_sigma: bool = option(True, "learn the standard deviation")
+
+
+@dataclass(frozen=True)
+class Linear(Gaussian):
+    """Mean and value linear in fixed features of the observation."""
+
+    features: str = option("identity", "what they are linear in", choices=tuple(FEATURES))
+    order: int = option(2, "degree, highest frequency, or grid points of an axis", at_least=1)
 
 
 @dataclass(frozen=True)
@@ -75,8 +107,8 @@ class Run:
 
 GROUPS: dict[str, dict[str, type]] = {
     "env": {name: entry.config for name, entry in envs.REGISTRY.items()},
-    "algo": {"td": TD, "reinforce": Reinforce},
-    "network": {"mlp": MLP},
+    "algo": {"td": TD, "reinforce": Reinforce, "online": Online},
+    "network": {"mlp": MLP, "linear": Linear},
 }
 
 

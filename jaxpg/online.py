@@ -1,0 +1,159 @@
+"""The per-step actor-critic: actor and critic learn after every step of the environment, along eligibility traces.
+
+The lesson's online update (sections 4.1, 7 and 8.1), with traces; of any networks, and of several environments at once.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from jaxpg import normalization
+from jaxpg.actor_critic import sampling_policy
+from jaxpg.networks import Networks
+from jaxpg.returns import td_errors
+from jaxpg.rollout import rollout
+from jaxpg.types import Algorithm, Metrics, PyTree, TrainState, Transition
+from jaxpg.vector_env import VectorEnv, stagger
+
+
+class Traces(NamedTuple):
+    """What each environment remembers of its episode; leaves `[N, ...]`.
+
+    Attributes:
+      actor: z_theta, like the actor's parameters.
+      critic: z_w, like the critic's parameters.
+      factor: I = gamma^t, or 1 where it is left out, `[N]`.
+    """
+
+    actor: PyTree
+    critic: PyTree
+    factor: jax.Array
+
+
+def online_actor_critic(
+    env: VectorEnv,
+    networks: Networks,
+    *,
+    num_steps: int,
+    gamma: float,
+    lambda_actor: float,
+    lambda_critic: float,
+    actor_lr: float,
+    critic_lr: float,
+    reward_scale: float = 1.0,
+    discounted: bool = False,
+    normalize_observations: bool = True,
+) -> Algorithm:
+    """Actor-critic with one plain update after every step.
+
+        delta   = r_t + gamma V_w(s_{t+1}) - V_w(s_t)
+        z_w     = gamma lambda_critic z_w + grad_w V_w(s_t)
+        z_theta = gamma lambda_actor z_theta + I grad_theta log pi_theta(a_t | s_t)
+        w      += alpha_c delta z_w
+        theta  += alpha_a delta z_theta
+        I       = gamma I
+
+    All gradients are at the parameters before the update. Termination sets the discount of the bootstrap to 0; a time
+    limit bootstraps from the value of the true next observation. After either the traces are 0 and I is 1. With N
+    environments each has its own traces, and the updates are the mean of theirs; N = 1 is the lesson's.
+
+    Args:
+      env: N environments.
+      networks: policy and value.
+      num_steps: environment steps, each with its update of the parameters, that make one step of the `Algorithm`.
+      gamma: discount, in [0, 1].
+      lambda_actor, lambda_critic: decay of the accumulating traces, in [0, 1]; 0 is the lesson's update.
+      actor_lr, critic_lr: alpha_a and alpha_c. Nothing shortens a step: too large a step size diverges.
+      reward_scale: factor on the rewards that are learned from; reported returns are not scaled.
+      discounted: with the factor I = gamma^t; without it I = 1, as in the lesson.
+      normalize_observations: feed the networks (s - mean) / std with running statistics, updated after `num_steps`.
+
+    Returns:
+      `Algorithm(init, step)` with the metrics of `actor_critic`, as far as there are some.
+
+    Source: the lesson, sections 4.1, 7 and 8.1; Sutton and Barto, Reinforcement Learning, 2nd edition, section 13.5.
+    """
+
+    def no_traces(params: PyTree) -> Traces:
+        zeros = jax.tree.map(lambda x: jnp.zeros((env.num_envs, *x.shape), x.dtype), params)
+        return Traces(zeros["actor"], zeros["critic"], jnp.ones(env.num_envs))
+
+    def init(key: jax.Array) -> TrainState:
+        key_params, key_reset, key_stagger = jax.random.split(key, 3)
+        params = networks.init(key_params)
+        env_state = stagger(env.reset(key_reset), key_stagger, env.episode_length)
+        normalizer = normalization.init(env.observation_size)
+        return TrainState(params, no_traces(params), normalizer, env_state, jnp.zeros((), jnp.int32))
+
+    def learn(params: PyTree, traces: Traces, normalizer: PyTree, step: Transition) -> tuple[PyTree, Traces, Metrics]:
+        """The update above, of one step `[N, ...]` of each environment."""
+        obs = normalization.normalize(normalizer, step.obs)
+        next_obs = normalization.normalize(normalizer, step.next_obs)
+
+        def log_prob(actor, obs, u):
+            mean, log_std = networks.policy(actor, obs)
+            return networks.distribution.log_prob(u, mean, log_std), jnp.exp(log_std)
+
+        value, value_gradient = _each(jax.value_and_grad(networks.value))(params["critic"], obs)
+        score, sigma = _each(jax.grad(log_prob, has_aux=True))(params["actor"], obs, step.u)
+        discount = gamma * (1 - step.terminated)
+        delta = td_errors(reward_scale * step.reward, discount, value, networks.value(params["critic"], next_obs))
+        z_critic = jax.tree.map(lambda z, g: gamma * lambda_critic * z + g, traces.critic, value_gradient)
+        z_actor = jax.tree.map(
+            lambda z, g: gamma * lambda_actor * z + _along(traces.factor, g) * g, traces.actor, score
+        )
+
+        def ascend(x, z, step_size):
+            return x + step_size * jnp.mean(_along(delta, z) * z, axis=0)
+
+        params = {
+            "actor": jax.tree.map(lambda x, z: ascend(x, z, actor_lr), params["actor"], z_actor),
+            "critic": jax.tree.map(lambda x, z: ascend(x, z, critic_lr), params["critic"], z_critic),
+        }
+        goes_on = 1 - jnp.maximum(step.terminated, step.truncated)
+        z_actor, z_critic = jax.tree.map(lambda z: _along(goes_on, z) * z, (z_actor, z_critic))
+        factor = jnp.where(goes_on > 0, (gamma if discounted else 1.0) * traces.factor, 1.0)
+        metrics = {
+            "td_error": jnp.mean(jnp.abs(delta)),
+            "value": jnp.mean(value),
+            "sigma": jnp.mean(sigma),
+            "return_sum": jnp.sum(step.episode_return),
+            "episodes": jnp.sum(step.episode_end),
+        }
+        return params, Traces(z_actor, z_critic, factor), metrics
+
+    def step(state: TrainState, key: jax.Array) -> tuple[TrainState, Metrics]:
+        def one(carry, key):
+            params, traces, env_state = carry
+            policy_fn = sampling_policy(networks, params, state.normalizer)
+            env_state, transition = rollout(policy_fn, env.step, env_state, key, length=1)
+            params, traces, metrics = learn(params, traces, state.normalizer, jax.tree.map(lambda x: x[0], transition))
+            return (params, traces, env_state), (transition.obs[0], metrics)
+
+        carry = state.params, state.opt_state, state.env_state
+        (params, traces, env_state), (obs, metrics) = jax.lax.scan(one, carry, jax.random.split(key, num_steps))
+        normalizer = state.normalizer
+        if normalize_observations:
+            normalizer = normalization.update(normalizer, obs)
+        summed = ("return_sum", "episodes")
+        metrics = {name: (jnp.sum if name in summed else jnp.mean)(x) for name, x in metrics.items()}
+        return TrainState(params, traces, normalizer, env_state, state.update + 1), metrics
+
+    return Algorithm(init, step)
+
+
+def _each(function):
+    """`function(params, *arrays)` of every environment apart: the arrays' rows under the same parameters."""
+
+    def apply(params, *arrays):
+        return jax.vmap(lambda *rows: function(params, *rows))(*arrays)
+
+    return apply
+
+
+def _along(x: jax.Array, like: jax.Array) -> jax.Array:
+    """`[N]` with as many axes as `like`, `[N, ...]`."""
+    return x.reshape(x.shape + (1,) * (like.ndim - 1))
