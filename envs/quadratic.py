@@ -41,15 +41,36 @@ class QuadraticConfig:
     episode_length: int = option(50, "steps until the time limit", at_least=1)
 
 
+_POLICY = {
+    "network": "linear",
+    "network.sigma_is": "fixed",
+    "network.squash": False,
+    "algo.normalize_observations": False,
+}
+_QUADRATIC = {"network.features": "polynomial", "network.order": 2}  # the critic can be the value function itself
 TRAINING = {
-    name: {
-        "network": "linear",
+    "td": _POLICY
+    | _QUADRATIC
+    | {"num_envs": 32, "total_steps": 400_000, "algo.actor_lr": 0.05, "algo.critic_lr": 0.05},
+    "reinforce": {
+        **_POLICY,
         "network.features": "identity",
-        "network.sigma_is": "fixed",
-        "network.squash": False,
-        "algo.normalize_observations": False,
-    }
-    for name in ("td", "reinforce", "online")
+        "num_envs": 32,
+        "total_steps": 800_000,
+        "algo.baseline": "leave_one_out",
+        "algo.discounted": True,
+        "algo.actor_lr": 0.1,
+        "algo.final_lr": 0.01,
+    },
+    "online": {
+        **_POLICY,
+        **_QUADRATIC,
+        "num_envs": 1,
+        "num_steps": 50,
+        "total_steps": 200_000,
+        "algo.actor_lr": 0.02,
+        "algo.critic_lr": 0.02,
+    },
 }
 
 

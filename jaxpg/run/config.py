@@ -82,6 +82,8 @@ def _complete(config: Config) -> Config:
             raise OptionError(["algo.baseline=leave_one_out needs other episodes: num_envs must be at least 2"])
         if config.algo.discounted and config.algo.returns == "whole":
             raise OptionError(["algo.discounted=true: whole returns have the factors gamma^t in them; leave it out"])
+    if config.choices["network"] == "linear" and config.network.features == "radial" and config.network.order < 2:
+        raise OptionError([f"network.order={config.network.order}: radial features need at least 2 points of an axis"])
     if config.run.num_seeds + config.run.seed > 2**32:
         raise OptionError([f"seed={config.run.seed} num_seeds={config.run.num_seeds}: seeds must stay below 2**32"])
     return dataclasses.replace(config, run=dataclasses.replace(config.run, num_steps=given or DEFAULT_ROLLOUT))

@@ -12,9 +12,11 @@ import jax.numpy as jnp
 import optax
 
 import envs
+from envs.options import OptionError
 from jaxpg.actor_critic import Method, actor_critic, deterministic_policy, reinforce, td
 from jaxpg.distributions import GAUSSIAN, SQUASHED_GAUSSIAN
 from jaxpg.evaluation import Episodes, evaluate
+from jaxpg.features import num_features
 from jaxpg.networks import Networks, linear_networks, mlp_networks
 from jaxpg.online import online_actor_critic
 from jaxpg.run.config import Config
@@ -25,6 +27,7 @@ from jaxpg.vector_env import vectorize
 
 # Evaluations during training play the same starts in every run; `jaxpg.evaluate` draws others.
 SELECTION_SEED = 2**31
+MAX_FEATURES = 10_000  # of a linear network; a grid over many observations is soon beyond any memory
 
 
 class Schedule(NamedTuple):
@@ -89,7 +92,19 @@ def plan(config: Config, done: int = 0) -> Schedule:
 
 
 def make_env(config: Config) -> Any:
-    return envs.REGISTRY[config.choices["env"]].build(config.env)
+    """The environment; raises OptionError where it has a mistake to report, or where the features do not fit it."""
+    env = envs.REGISTRY[config.choices["env"]].build(config.env)
+    if config.choices["network"] == "linear":
+        network = config.network
+        number = num_features(network.features, env.observation_size, network.order)
+        if number > MAX_FEATURES:
+            raise OptionError(
+                [
+                    f"network.features={network.features} network.order={network.order}: {number:,} features of "
+                    f"{env.observation_size} observations; at most {MAX_FEATURES:,}"
+                ]
+            )
+    return env
 
 
 def make_networks(config: Config, env: Any) -> Networks:
