@@ -55,6 +55,19 @@ TRAINING = {
         "algo.reward_scale": 0.1,
         "network.sigma": 0.6,
     },
+    "online": {
+        "num_envs": 16,
+        "num_steps": 100,
+        "total_steps": 2_000_000,
+        "algo.reward_scale": 0.1,
+        "algo.actor_lr": 0.002,
+        "algo.critic_lr": 0.01,
+        "network": "linear",
+        "network.features": "fourier",
+        "network.order": 3,
+        "network.sigma": 0.5,
+        "network.sigma_is": "fixed",
+    },
 }
 
 

@@ -58,7 +58,6 @@ TRAINING = {
         "num_envs": 32,
         "total_steps": 800_000,
         "algo.baseline": "leave_one_out",
-        "algo.discounted": True,
         "algo.actor_lr": 0.1,
         "algo.final_lr": 0.01,
     },

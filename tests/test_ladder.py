@@ -5,11 +5,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-import envs
 from jaxpg.actor_critic import BASELINES, ESTIMATORS
 from jaxpg.run.config import compose
-from jaxpg.run.program import make_algorithm, make_method
-from jaxpg.training import train_scan
+from jaxpg.run.program import make_algorithm, make_env, make_method
+from jaxpg.training import initial_state, train_scan
 from jaxpg.types import Transition
 
 LADDER = [
@@ -17,19 +16,49 @@ LADDER = [
     *(("reinforce", f"algo.baseline={name}") for name in BASELINES),
     ("reinforce", "algo.returns=whole"),
     ("reinforce", "algo.discounted=true"),
+    ("online", "algo.discounted=false"),
+    ("online", "algo.discounted=true"),
 ]
+NAMES = [f"{algo}, {option}" for algo, option in LADDER]
 
 
 def configured(*options):
     return compose(["env=pendulum", "num_envs=4", "env.episode_length=8", "network.widths=[8]", *options])
 
 
-@pytest.mark.parametrize(("algo", "option"), LADDER, ids=[option for _, option in LADDER])
-def test_estimators_train(algo, option):
-    algorithm = make_algorithm(configured(f"algo={algo}", option), envs.make("pendulum"))
+@pytest.mark.parametrize(("algo", "option"), LADDER, ids=NAMES)
+def test_estimators_learn_the_quadratic_problem(algo, option):
+    """With the tuned options, two seeds at once: from a return of -12.5 to better than -1; the best possible is -0.48.
+
+    Two chunks are one of twice the length, to the bit.
+    """
+    config = compose(["env=quadratic", f"algo={algo}", option])
+    algorithm, length = make_algorithm(config, make_env(config)), {"td": 30, "reinforce": 10, "online": 50}[algo]
+    keys = jnp.stack([jax.random.key(seed) for seed in (0, 1)])
+
+    one, two = (
+        jax.jit(jax.vmap(lambda key, state, n=n: train_scan(algorithm, key, n, state))) for n in (length, 2 * length)
+    )
+
+    with jax.debug_key_reuse(False):  # see test_vmapped_seeds_are_single_seeds
+        states = [jax.jit(jax.vmap(lambda key: initial_state(algorithm, key)))(keys)]
+        for _ in range(4):
+            state, metrics = one(keys, states[-1])
+            states.append(state)
+        assert (metrics["return_sum"].sum(1) / metrics["episodes"].sum(1) > -1).all()
+        both, _ = two(keys, states[0])
+    jax.tree.map(np.testing.assert_array_equal, both.params, states[2].params)
+
+
+@pytest.mark.study
+@pytest.mark.parametrize("env", ["pendulum", "arm"])
+@pytest.mark.parametrize(("algo", "option"), LADDER, ids=NAMES)
+def test_estimators_train(env, algo, option):
+    """Twenty updates of the environments proper; enough to learn something only with the quadratic problem."""
+    config = compose([f"env={env}", f"algo={algo}", option, "num_envs=16"])
+    algorithm = make_algorithm(config, make_env(config))
     state, metrics = jax.jit(lambda key: train_scan(algorithm, key, 20))(jax.random.key(0))
-    assert all(np.isfinite(x).all() for x in jax.tree.leaves(state.params))
-    assert np.isfinite(metrics["policy_loss"]).all()
+    assert all(np.isfinite(x).all() for x in jax.tree.leaves((state.params, metrics)))
 
 
 def advantages(*options):
