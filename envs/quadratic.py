@@ -137,7 +137,7 @@ class LinearQuadratic:
     """A `Problem` as an environment of brax's interface; its horizon is the caller's time limit.
 
     Args:
-      problem: what to play. Its noise is drawn from a key that the state carries.
+      problem: what to play. Its noise is drawn from a key that the state carries; without noise there is none.
     """
 
     def __init__(self, problem: Problem):
@@ -149,18 +149,21 @@ class LinearQuadratic:
     def reset(self, rng: jax.Array) -> State:
         """s_0 ~ N(m_0, S_0)."""
         key_start, key_noise = jax.random.split(rng)
-        start = jnp.asarray(self.problem.initial_mean, float)
-        s = start + self._spread @ jax.random.normal(key_start, start.shape, start.dtype)
-        return initial_state(jax.random.key_data(key_noise), s)
+        s = jnp.asarray(self.problem.initial_mean, float)
+        if self._spread.any():
+            s = s + self._spread @ jax.random.normal(key_start, s.shape, s.dtype)
+        return initial_state(jax.random.key_data(key_noise) if self._noise.any() else None, s)
 
     def step(self, state: State, action: jax.Array) -> State:
-        """s' = A s + B a + w,  r = -(s'' Q s' + a' R a)."""
-        problem, s = self.problem, state.obs
-        key, key_noise = jax.random.split(jax.random.wrap_key_data(state.pipeline_state))
-        noise = self._noise @ jax.random.normal(key_noise, s.shape, s.dtype)
-        following = problem.A @ s + problem.B @ action + noise
+        """s' = A s + B a + w,  r = -(s'^T Q s' + a^T R a)."""
+        problem, carried = self.problem, state.pipeline_state
+        following = problem.A @ state.obs + problem.B @ action
+        if self._noise.any():
+            key, key_noise = jax.random.split(jax.random.wrap_key_data(carried))
+            carried = jax.random.key_data(key)
+            following = following + self._noise @ jax.random.normal(key_noise, following.shape, following.dtype)
         cost = following @ problem.Q @ following + action @ problem.R @ action
-        return state.replace(pipeline_state=jax.random.key_data(key), obs=following, reward=-cost)
+        return state.replace(pipeline_state=carried, obs=following, reward=-cost)
 
 
 def _root(covariance: np.ndarray) -> np.ndarray:

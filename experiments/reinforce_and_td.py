@@ -31,7 +31,9 @@ def main() -> None:
     figure = Figure(figsize=(11, 4.2), layout="constrained")
     summary = {}
     with tempfile.TemporaryDirectory() as folder:
-        for axes, (task, (metric, ylabel, total_steps)) in zip(figure.subplots(1, 2), TASKS.items(), strict=True):
+        for axes, (task, (metric, ylabel, total_steps)) in zip(
+            figure.subplots(1, len(TASKS), squeeze=False)[0], TASKS.items(), strict=True
+        ):
             for algo, label in ALGORITHMS.items():
                 run = Path(folder) / f"{task}-{algo}"
                 train(run, f"env={task}", f"algo={algo}", f"num_seeds={NUM_SEEDS}", f"total_steps={total_steps}")
