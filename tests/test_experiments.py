@@ -27,7 +27,7 @@ def experiments(monkeypatch, command_environment, tmp_path):
     monkeypatch.setattr(commands, "train", tiny)
     monkeypatch.setattr(commands, "RESULTS", tmp_path)
     yield tmp_path
-    for name in ("commands", "default_runs", "reinforce_and_td"):
+    for name in ("commands", "default_runs", "reinforce_and_td", "lesson_toy", "online_pendulum"):
         sys.modules.pop(name, None)
 
 
@@ -56,3 +56,30 @@ def test_reinforce_and_td(experiments, monkeypatch):
     assert set(summary) == {"pendulum td", "pendulum reinforce"}
     assert all(curve["steps"] for curve in summary.values())
     assert (experiments / "reinforce_and_td.png").read_bytes().startswith(b"\x89PNG")
+
+
+def test_lesson_toy(experiments, monkeypatch):
+    import lesson_toy
+
+    monkeypatch.setattr(lesson_toy, "RESULTS", experiments)
+    monkeypatch.setattr(lesson_toy, "NUM_UPDATES", 5)
+    monkeypatch.setattr(lesson_toy, "LESSON_SEEDS", 2)
+    monkeypatch.setattr(lesson_toy, "DEFAULT_SEEDS", 2)
+    lesson_toy.main()
+    summary = json.loads((experiments / "lesson_toy.json").read_text())
+    assert summary["the lesson's update"]["after 5 updates"]["median cost over best"] > 1
+    assert (experiments / "lesson_toy.png").read_bytes().startswith(b"\x89PNG")
+
+
+def test_online_pendulum(experiments, monkeypatch):
+    import online_pendulum
+
+    monkeypatch.setattr(online_pendulum, "RESULTS", experiments)
+    monkeypatch.setattr(online_pendulum, "NUM_SEEDS", 2)
+    monkeypatch.setattr(online_pendulum, "FACTORS", (1.0,))
+    monkeypatch.setattr(online_pendulum, "NETWORKS", {"linear": ()})
+    monkeypatch.setattr(online_pendulum, "SIZES", ("num_envs=2", "total_steps=800", "env.episode_length=10"))
+    online_pendulum.main()
+    summary = json.loads((experiments / "online_pendulum.json").read_text())
+    assert len(summary["curves"]["linear"]["steps"]) > 1
+    assert (experiments / "online_pendulum.png").read_bytes().startswith(b"\x89PNG")

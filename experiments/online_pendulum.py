@@ -1,0 +1,88 @@
+"""The per-step actor-critic on the pendulum: linear in Fourier features and with an MLP, and where it breaks.
+
+    python experiments/online_pendulum.py
+
+Left: the lesson's online update with traces, tuned defaults (`env=pendulum algo=online`: linear in Fourier features of
+order 3) and the same with two hidden layers; return of the sampled actions while learning. Right: the linear one with
+its two step sizes multiplied by the same factor: return over the last tenth of the run. Five seeds each.
+
+Writes results/online_pendulum.png and results/online_pendulum.json.
+"""
+
+from __future__ import annotations
+
+import json
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from commands import RESULTS, write_json
+from matplotlib.figure import Figure
+
+from jaxpg.run.config import compose
+from jaxpg.run.figures import draw_curve
+from jaxpg.run.program import make_algorithm, make_env, plan
+from jaxpg.run.statistics import interquartile_mean
+from jaxpg.training import train_scan
+
+NUM_SEEDS = 5
+POINTS = 40  # of a curve
+MLP = ("network=mlp", "network.widths=[32,32]", "network.sigma_is=fixed", "algo.actor_lr=0.003", "algo.critic_lr=0.02")
+NETWORKS = {"linear, Fourier features": (), "MLP": MLP}
+FACTORS = (0.1, 0.3, 1.0, 3.0, 10.0)
+SIZES: tuple[str, ...] = ()  # options for all runs
+
+
+def returns(*options: str) -> tuple[np.ndarray, np.ndarray]:
+    """Steps `[K]` and mean return of the episodes that ended since the last point, `[S, K]`."""
+    config = compose(["env=pendulum", "algo=online", *SIZES, *options])
+    algorithm, schedule = make_algorithm(config, make_env(config)), plan(config)
+    keys = jnp.stack([jax.random.key(seed) for seed in range(NUM_SEEDS)])
+    _, metrics = jax.jit(jax.vmap(lambda key: train_scan(algorithm, key, schedule.num_updates)))(keys)
+    points = min(POINTS, schedule.num_updates)
+    ends = np.linspace(0, schedule.num_updates, points + 1).astype(int)[1:]
+    total = np.cumsum(metrics["return_sum"], axis=1, dtype=float)[:, ends - 1]
+    episodes = np.cumsum(metrics["episodes"], axis=1, dtype=float)[:, ends - 1]
+    earned = np.diff(total, axis=1, prepend=0) / np.maximum(np.diff(episodes, axis=1, prepend=0), 1)
+    return ends * schedule.steps_per_update, earned
+
+
+def main() -> None:
+    figure = Figure(figsize=(11, 4.2), layout="constrained")
+    left, right = figure.subplots(1, 2)
+    summary = {"curves": {}, "step sizes": {}}
+    for label, options in NETWORKS.items():
+        steps, earned = returns(*options)
+        draw_curve(left, steps, earned, label)
+        summary["curves"][label] = {
+            "steps": steps.tolist(),
+            "interquartile_mean": interquartile_mean(earned).round(1).tolist(),
+            "at the end, by seed": earned[:, -1].round(1).tolist(),
+        }
+    left.set(xlabel="environment steps, each with its update", ylabel="return of sampled actions")
+    tuned = compose(["env=pendulum", "algo=online"]).algo
+    ends = {}
+    for factor in FACTORS:
+        options = f"algo.actor_lr={factor * tuned.actor_lr}", f"algo.critic_lr={factor * tuned.critic_lr}"
+        _, earned = returns(*options)
+        ends[factor] = earned[:, -max(1, earned.shape[1] // 10) :].mean(axis=1)
+        kept = ends[factor][np.isfinite(ends[factor])]
+        summary["step sizes"][str(factor)] = {
+            "return by seed": [round(x, 1) if np.isfinite(x) else None for x in ends[factor].tolist()],
+            "diverged": int(NUM_SEEDS - len(kept)),
+        }
+        right.plot([factor] * len(kept), kept, "o", color="C0", alpha=0.6)
+        if len(kept) < NUM_SEEDS:
+            right.annotate(f"{NUM_SEEDS - len(kept)} diverged", (factor, 0), ha="center", fontsize=8)
+    right.set(xscale="log", xlabel="factor on both step sizes", ylabel="return at the end, by seed", ylim=(-1700, 60))
+    left.legend(loc="lower right", fontsize=8)
+    for axes in (left, right):
+        axes.grid(alpha=0.3)
+    RESULTS.mkdir(exist_ok=True)
+    figure.savefig(RESULTS / "online_pendulum.png", dpi=110)
+    write_json("online_pendulum.json", summary)
+    print(json.dumps(summary["step sizes"], indent=1))
+
+
+if __name__ == "__main__":
+    main()
