@@ -4,6 +4,7 @@ import json
 import sys
 from pathlib import Path
 
+import jax
 import pytest
 
 EXPERIMENTS = Path(__file__).parent.parent / "experiments"
@@ -65,7 +66,8 @@ def test_lesson_toy(experiments, monkeypatch):
     monkeypatch.setattr(lesson_toy, "NUM_UPDATES", 5)
     monkeypatch.setattr(lesson_toy, "LESSON_SEEDS", 2)
     monkeypatch.setattr(lesson_toy, "DEFAULT_SEEDS", 2)
-    lesson_toy.main()
+    with jax.debug_key_reuse(False):  # see test_vmapped_seeds_are_single_seeds
+        lesson_toy.main()
     summary = json.loads((experiments / "lesson_toy.json").read_text())
     assert summary["the lesson's update"]["after 5 updates"]["median cost over best"] > 1
     assert (experiments / "lesson_toy.png").read_bytes().startswith(b"\x89PNG")
@@ -79,7 +81,8 @@ def test_online_pendulum(experiments, monkeypatch):
     monkeypatch.setattr(online_pendulum, "FACTORS", (1.0,))
     monkeypatch.setattr(online_pendulum, "NETWORKS", {"linear": ()})
     monkeypatch.setattr(online_pendulum, "SIZES", ("num_envs=2", "total_steps=800", "env.episode_length=10"))
-    online_pendulum.main()
+    with jax.debug_key_reuse(False):  # see test_vmapped_seeds_are_single_seeds
+        online_pendulum.main()
     summary = json.loads((experiments / "online_pendulum.json").read_text())
     assert len(summary["curves"]["linear"]["steps"]) > 1
     assert (experiments / "online_pendulum.png").read_bytes().startswith(b"\x89PNG")
