@@ -1,146 +1,35 @@
 """The estimators' mean is what theory gives, on the linear-quadratic problem, where theory gives a number.
 
-Trajectories are played by numpy in float64. For each the estimate sum_t score_t A_t of the gradient in K, k and log
-sigma is one sample; their mean has to be within four standard errors of the closed form in every component (with some
-8 components, a right estimator is further away in one of 2,000 draws; the seeds are fixed). Wrong variants are further
+The mean of 40,000 samples has to be within four standard errors of the closed form in every component (with some 8
+components, a right estimator is further away in one of 2,000 draws; the seeds are fixed). Wrong variants are further
 away: each test has its own.
 """
-
-import functools
-from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from test_quadratic import random_policy, random_problem
+from linear_quadratic import (
+    LADDER,
+    UNBIASED,
+    closed_form,
+    errors,
+    measure,
+    play,
+    policy,
+    problem,
+    samples,
+    to_go,
+    with_baseline,
+    wrong_critic,
+)
 
-from envs.quadratic import gradient, lambda_targets, values
+from envs.quadratic import lambda_targets
 from jaxpg import baselines, estimators
 from jaxpg.returns import discount_factors, discounted_returns
 
-NUM_TRAJECTORIES = 40_000
 ERRORS = 4.0  # that a right estimator may be away
 SEEN = 6.0  # that a wrong one is away at least
-
-
-class Played(NamedTuple):
-    """`[T, N, ...]`; the critics' values are exact (`value`) and those of another policy (`wrong_value`).
-
-    `beyond` is `next_value` as if the last step were not the last one.
-    """
-
-    reward: np.ndarray
-    discount: np.ndarray
-    score: np.ndarray
-    value: np.ndarray
-    next_value: np.ndarray
-    beyond: np.ndarray
-    wrong_value: np.ndarray
-    wrong_next_value: np.ndarray
-    noise: np.ndarray
-
-
-@functools.cache
-def problem(n):
-    return random_problem(seed=n, n=n, m=min(n, 2), horizon=5, discount=0.8)
-
-
-@functools.cache
-def policy(n):
-    return random_policy(n, problem(n))
-
-
-@functools.cache
-def wrong_critic(n):
-    """The values of quite another policy."""
-    return values(problem(n), random_policy(77, problem(n)))
-
-
-@functools.cache
-def play(n, num_trajectories=NUM_TRAJECTORIES, seed=0):
-    case, (K, k, sigma), random = problem(n), policy(n), np.random.default_rng(seed)
-    exact, wrong = values(case, policy(n)), wrong_critic(n)
-
-    def noise(covariance):
-        return random.normal(size=(num_trajectories, len(covariance))) @ np.linalg.cholesky(covariance).T
-
-    s = case.initial_mean + noise(case.initial_covariance)
-    steps = []
-    for t in range(case.horizon):
-        epsilon = random.normal(size=(num_trajectories, len(k)))
-        a = s @ K.T + k + sigma * epsilon
-        following = s @ case.A.T + a @ case.B.T + noise(case.W)
-        cost = np.einsum("ni,ij,nj->n", following, case.Q, following) + np.einsum("ni,ij,nj->n", a, case.R, a)
-        in_mean = epsilon / sigma
-        in_K = (in_mean[:, :, None] * s[:, None, :]).reshape(num_trajectories, -1)
-        in_log_sigma = np.sum(epsilon**2 - 1, axis=1, keepdims=True)
-        score = np.concatenate([in_K, in_mean, in_log_sigma], axis=1)
-        last = t == case.horizon - 1
-        steps.append(
-            Played(
-                reward=-cost,
-                discount=np.full(num_trajectories, 0.0 if last else case.discount),
-                score=score,
-                value=exact[t](s),
-                next_value=exact[t + 1](following),
-                beyond=exact[0 if last else t + 1](following),
-                wrong_value=wrong[t](s),
-                wrong_next_value=wrong[t + 1](following),
-                noise=epsilon[:, 0],
-            )
-        )
-        s = following
-    return Played(*(np.stack(field) for field in zip(*steps, strict=True)))
-
-
-def flat(policy_like):
-    return np.concatenate([policy_like.K.ravel(), policy_like.k, [policy_like.sigma]])
-
-
-def closed_form(n, **options):
-    return flat(gradient(problem(n), policy(n), **options))
-
-
-def errors(samples, expected):
-    """How many standard errors the samples' mean is away, in each component."""
-    return (samples.mean(0) - expected) / (samples.std(0) / np.sqrt(len(samples)))
-
-
-def samples(played, advantage_of):
-    """sum_t score_t A_t of each trajectory, `[N, parameters]`."""
-    with jax.enable_x64(True):
-        advantage = np.asarray(advantage_of(jax.tree.map(jnp.asarray, played)))
-    return np.einsum("tnp,tn->np", played.score, advantage)
-
-
-def squared(score):
-    return jnp.sum(score**2, axis=-1)
-
-
-def to_go(played):
-    return discounted_returns(played.reward, played.discount, 0.0)
-
-
-def with_baseline(baseline_of):
-    return lambda p: estimators.reinforce(p.reward, p.discount, baseline_of(p)).advantage
-
-
-UNBIASED = {
-    "returns": with_baseline(lambda p: 0.0),
-    "returns, batch mean": with_baseline(lambda p: baselines.batch_mean(to_go(p))),
-    "returns, time mean": with_baseline(lambda p: baselines.time_mean(to_go(p))),
-    "returns, leave one out": with_baseline(lambda p: baselines.leave_one_out(to_go(p))),
-    "returns, optimal": with_baseline(lambda p: baselines.optimal(to_go(p), squared(p.score))),
-    "returns, value": with_baseline(lambda p: p.value),
-    "returns, wrong value": with_baseline(lambda p: p.wrong_value),
-    "td_zero": lambda p: estimators.td_zero(p.reward, p.discount, p.value, p.next_value).advantage,
-    "n_step": lambda p: estimators.n_step(p.reward, p.discount, p.value, p.next_value, 3).advantage,
-    "td_lambda": lambda p: estimators.td_lambda(p.reward, p.discount, p.value, p.next_value, 0.7).advantage,
-    "td_lambda 1, wrong critic": lambda p: (
-        estimators.td_lambda(p.reward, p.discount, p.wrong_value, p.wrong_next_value, 1.0).advantage
-    ),
-}
 
 
 @pytest.mark.parametrize("n", [1, 3])
@@ -235,3 +124,11 @@ def test_order_of_the_variances():
     assert variance("returns, value") > variance("td_lambda") > variance("td_zero")
     undiscounted = samples(played, lambda p: discount_factors(p.discount) * to_go(p)).var(0).sum()
     assert whole > undiscounted
+
+
+@pytest.mark.study
+@pytest.mark.parametrize("n", [1, 3])
+def test_a_million_trajectories(n):
+    """Every estimator's mean is the one that theory gives it, biased or not, within SE_STUDY standard errors."""
+    for name, moments in measure(n, num_batches=20).items():
+        assert np.abs(moments.errors(LADDER[name].mean(n))).max() < 3, name

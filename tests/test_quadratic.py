@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from linear_quadratic import random_policy, random_problem
 
 from envs.quadratic import (
     Policy,
@@ -26,33 +27,6 @@ from jaxpg.run.config import compose
 from jaxpg.run.program import make_algorithm, make_env, plan
 from jaxpg.training import train_scan
 from jaxpg.vector_env import vectorize
-
-
-def random_problem(seed, n, m, horizon=6, discount=0.9):
-    random = np.random.default_rng(seed)
-
-    def covariance(size):
-        root = random.normal(size=(size, size))
-        return root @ root.T / size
-
-    return Problem(
-        A=random.normal(size=(n, n)) / np.sqrt(n),
-        B=random.normal(size=(n, m)),
-        Q=covariance(n),
-        R=covariance(m) + 0.1 * np.eye(m),
-        W=0.1 * covariance(n),
-        initial_mean=random.normal(size=n),
-        initial_covariance=covariance(n),
-        horizon=horizon,
-        discount=discount,
-    )
-
-
-def random_policy(seed, problem):
-    random = np.random.default_rng(seed + 1)
-    n, m = problem.B.shape
-    return Policy(0.3 * random.normal(size=(m, n)), random.normal(size=m), 0.4)
-
 
 problems = st.builds(
     random_problem,
