@@ -60,6 +60,7 @@ class Played(NamedTuple):
     wrong_value: np.ndarray
     wrong_next_value: np.ndarray
     noise: np.ndarray
+    state: np.ndarray
 
 
 @functools.cache
@@ -109,6 +110,7 @@ def play(n, num_trajectories=40_000, seed=0):
                 wrong_value=wrong[t](s),
                 wrong_next_value=wrong[t + 1](following),
                 noise=epsilon[:, 0],
+                state=s,
             )
         )
         s = following
