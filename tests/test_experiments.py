@@ -28,7 +28,7 @@ def experiments(monkeypatch, command_environment, tmp_path):
     monkeypatch.setattr(commands, "train", tiny)
     monkeypatch.setattr(commands, "RESULTS", tmp_path)
     yield tmp_path
-    for name in ("commands", "default_runs", "reinforce_and_td", "lesson_toy", "online_pendulum"):
+    for name in ("commands", "default_runs", "reinforce_and_td", "lesson_toy", "online_pendulum", "estimator_table"):
         sys.modules.pop(name, None)
 
 
@@ -86,3 +86,14 @@ def test_online_pendulum(experiments, monkeypatch):
     summary = json.loads((experiments / "online_pendulum.json").read_text())
     assert len(summary["curves"]["linear"]["steps"]) > 1
     assert (experiments / "online_pendulum.png").read_bytes().startswith(b"\x89PNG")
+
+
+def test_estimator_table(experiments, monkeypatch, capsys):
+    import estimator_table
+
+    monkeypatch.setattr(estimator_table, "NUM_BATCHES", 1)
+    estimator_table.main()
+    table = json.loads((experiments / "estimator_table.json").read_text())
+    assert capsys.readouterr().out.count("\n") == len(table) + 2
+    assert max(row["errors"] for sizes in table.values() for row in sizes.values()) < 4
+    assert table["td_zero, wrong critic"]["n = 3"]["bias"] > 0.5
