@@ -7,8 +7,8 @@ order 3) and the same with two hidden layers; return of the sampled actions whil
 its two step sizes multiplied by the same factor: return over the last tenth of the run. Five seeds each.
 
 What one sees: with linear features five of five seeds solve it, from step sizes of a third to three times the tuned
-ones; at ten times they are worse and far apart, at a tenth only slow. The MLP ends better with the seeds that solve it and
-leaves two of five at -780.
+ones; at ten times they are worse and far apart, at a tenth only slow. The MLP ends better with the seeds that solve
+it and leaves two of five at -780.
 
 Writes results/online_pendulum.png and results/online_pendulum.json.
 """
