@@ -49,9 +49,14 @@ _POLICY = {
 }
 _QUADRATIC = {"network.features": "polynomial", "network.order": 2}  # the critic can be the value function itself
 TRAINING = {
-    "td": _POLICY
-    | _QUADRATIC
-    | {"num_envs": 32, "total_steps": 400_000, "algo.actor_lr": 0.05, "algo.critic_lr": 0.05},
+    "td": {
+        **_POLICY,
+        **_QUADRATIC,
+        "num_envs": 32,
+        "total_steps": 400_000,
+        "algo.actor_lr": 0.05,
+        "algo.critic_lr": 0.05,
+    },
     "reinforce": {
         **_POLICY,
         "network.features": "identity",
@@ -293,8 +298,8 @@ def gradient(
 def best_policy(problem: Problem, sigma: float) -> Policy:
     """The K and k of the largest J among the policies that are the same at every step, with this sigma.
 
-    Found by following the gradient in closed form; J is not concave in K, but has no other stationary point that is
-    stable (Fazel et al., arXiv 1801.05039, for long horizons). Raises RuntimeError where the search does not end.
+    Found by following the gradient in closed form, from the first of the `riccati_gains`; J is not concave in K, so it
+    is a local best only. Raises RuntimeError where the search does not end.
     """
     import scipy.optimize  # slow to import, and seldom needed
 

@@ -15,7 +15,9 @@ def play(env, num_envs, episode_length, length, seed=0, staggered=False):
     state = vector.reset(jax.random.key(seed))
     if staggered:
         state = stagger(state, jax.random.key(seed + 1), episode_length)
-    return rollout(lambda obs, key: jnp.zeros((num_envs, 1)), vector.step, state, jax.random.key(seed + 2), length)
+    return rollout(
+        lambda obs, key: (jnp.zeros((num_envs, 1)),) * 2, vector.step, state, jax.random.key(seed + 2), length
+    )
 
 
 def test_time_limit_truncates_and_does_not_terminate():
