@@ -1,5 +1,7 @@
 """The per-step actor-critic against the lesson's equations, written out in numpy."""
 
+import functools
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -85,6 +87,7 @@ def unpacked(params):
     return [np.asarray(x, np.float64) for x in arrays]
 
 
+@functools.cache
 def play(num_steps=60, **options):
     """Parameters before and after, and the steps: two variables, terminations and time limits, one environment."""
     env, log = Noted(chain(QuadraticConfig(state_size=2, start_spread=0.3, noise=0.3))), []
