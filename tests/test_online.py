@@ -7,7 +7,6 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-import envs
 from envs.quadratic import LinearQuadratic, QuadraticConfig, chain
 from jaxpg.distributions import GAUSSIAN
 from jaxpg.networks import linear_networks, mlp_networks
@@ -135,15 +134,10 @@ def test_wrong_variants_are_seen(name):
     assert max(np.abs(mine - other).max() for mine, other in zip(after, wrong, strict=True)) > 1e-5
 
 
-def pendulums(num_envs, num_steps, **options):
-    env = envs.make("pendulum")
-    networks = mlp_networks(env.observation_size, env.action_size, (8,))
-    return online_actor_critic(vectorize(env, num_envs, 20), networks, num_steps=num_steps, **OPTIONS | options)
-
-
 def test_seeds_and_chunks():
     """vmapped seeds are single seeds, and training in pieces is training in one piece."""
-    algorithm = pendulums(2, 30)
+    env = LinearQuadratic(chain(QuadraticConfig(state_size=2)))
+    algorithm = online_actor_critic(vectorize(env, 2, 20), mlp_networks(2, 2, (8,)), num_steps=30, **OPTIONS)
     train = jax.jit(lambda key: train_scan(algorithm, key, 6))
     with jax.debug_key_reuse(False):  # see test_vmapped_seeds_are_single_seeds
         both = jax.jit(jax.vmap(lambda key: train_scan(algorithm, key, 6)))(
