@@ -27,10 +27,11 @@ from matplotlib.figure import Figure
 from envs.quadratic import LinearQuadratic, Policy, QuadraticConfig, best_policy, chain, objective
 from jaxpg.distributions import gaussian_log_prob, gaussian_sample
 from jaxpg.estimators import reinforce
+from jaxpg.networks import linear_mean
 from jaxpg.rollout import rollout
 from jaxpg.run.config import compose
 from jaxpg.run.program import make_algorithm, make_env, plan
-from jaxpg.training import train_scan
+from jaxpg.training import initial_state, train_scan
 from jaxpg.vector_env import vectorize
 
 SIGMA, STEP_SIZE = 0.5, 0.001
@@ -70,10 +71,10 @@ def defaults(key: jax.Array) -> jax.Array:
 
     def update(state, _):
         state, _ = train_scan(algorithm, key, 1, state)
-        layer = state.params["actor"]["params"]["MLP_0"]["Dense_0"]
-        return state, jnp.concatenate([layer["kernel"][:, 0], layer["bias"]])
+        gain, offset = linear_mean(state.params["actor"])
+        return state, jnp.concatenate([gain[0], offset])
 
-    return jax.lax.scan(update, algorithm.init(jax.random.fold_in(key, 0)), length=plan(config).num_updates)[1]
+    return jax.lax.scan(update, initial_state(algorithm, key), length=plan(config).num_updates)[1]
 
 
 def cost(theta: np.ndarray) -> np.ndarray:
@@ -101,7 +102,8 @@ def state_of(theta: np.ndarray, best: float) -> dict[str, float]:
 
 
 def main() -> None:
-    best = -objective(chain(QuadraticConfig()), best_policy(chain(QuadraticConfig()), SIGMA))
+    problem = chain(QuadraticConfig())
+    best = -objective(problem, best_policy(problem, SIGMA))
     axes = (figure := Figure(figsize=(7, 4.2), layout="constrained")).subplots()
     axes.axhline(best, color="black", lw=1, ls=":", label="best linear policy")
     summary = {"best cost": best}

@@ -79,8 +79,7 @@ def wrong_critic(n):
     return values(problem(n), random_policy(77, problem(n)))
 
 
-@functools.cache
-def play(n, num_trajectories=40_000, seed=0):
+def simulate(n, num_trajectories, seed):
     case, (K, k, sigma), random = problem(n), policy(n), np.random.default_rng(seed)
     exact, wrong = values(case, policy(n)), wrong_critic(n)
 
@@ -117,6 +116,12 @@ def play(n, num_trajectories=40_000, seed=0):
     return Played(*(np.stack(field) for field in zip(*steps, strict=True)))
 
 
+@functools.cache
+def play(n, num_trajectories=40_000, seed=0):
+    """`simulate`, once for all who ask for the same."""
+    return simulate(n, num_trajectories, seed)
+
+
 def flat(policy_like):
     return np.concatenate([policy_like.K.ravel(), policy_like.k, [policy_like.sigma]])
 
@@ -125,9 +130,21 @@ def closed_form(n, **options):
     return flat(gradient(problem(n), policy(n), **options))
 
 
+class Moments(NamedTuple):
+    """Of an estimator's samples: their number, and mean and variance of each component."""
+
+    count: int
+    mean: np.ndarray
+    variance: np.ndarray
+
+    def errors(self, expected: np.ndarray) -> np.ndarray:
+        """How many standard errors the mean is away, in each component."""
+        return (self.mean - expected) / np.sqrt(self.variance / self.count)
+
+
 def errors(samples, expected):
     """How many standard errors the samples' mean is away, in each component."""
-    return (samples.mean(0) - expected) / (samples.std(0) / np.sqrt(len(samples)))
+    return Moments(len(samples), samples.mean(0), samples.var(0)).errors(expected)
 
 
 def samples(played, advantage_of):
@@ -149,6 +166,10 @@ def with_baseline(baseline_of):
     return lambda p: estimators.reinforce(p.reward, p.discount, baseline_of(p)).advantage
 
 
+def with_wrong_critic(lambda_):
+    return lambda p: estimators.td_lambda(p.reward, p.discount, p.wrong_value, p.wrong_next_value, lambda_).advantage
+
+
 UNBIASED = {
     "returns": with_baseline(lambda p: 0.0),
     "returns, batch mean": with_baseline(lambda p: baselines.batch_mean(to_go(p))),
@@ -160,55 +181,55 @@ UNBIASED = {
     "td_zero": lambda p: estimators.td_zero(p.reward, p.discount, p.value, p.next_value).advantage,
     "n_step": lambda p: estimators.n_step(p.reward, p.discount, p.value, p.next_value, 3).advantage,
     "td_lambda": lambda p: estimators.td_lambda(p.reward, p.discount, p.value, p.next_value, 0.7).advantage,
-    "td_lambda 1, wrong critic": lambda p: (
-        estimators.td_lambda(p.reward, p.discount, p.wrong_value, p.wrong_next_value, 1.0).advantage
-    ),
+    "td_lambda 1, wrong critic": with_wrong_critic(1.0),
 }
 
 
+def wrong_critic_mean(n, lambda_):
+    """The mean of the gradient by TD(lambda) with the wrong critic."""
+    following = lambda_targets(problem(n), policy(n), wrong_critic(n), lambda_)
+    return closed_form(n, following=following, discounted=False)
+
+
 class Rung(NamedTuple):
-    """One estimator of the ladder: its advantage, and the mean of its gradient on the problem with n variables."""
+    """One estimator of the ladder.
+
+    Attributes:
+      advantage: what it makes of the trajectories.
+      discounted: whether it is meant for the gradient of J, or for the sum without the factors gamma^t.
+      biased_mean: the mean of its gradient on the problem with n variables; None where it is what it is meant for.
+    """
 
     advantage: Callable[[Played], jax.Array]
-    mean: Callable[[int], np.ndarray]
+    discounted: bool = False
+    biased_mean: Callable[[int], np.ndarray] | None = None
 
+    def target(self, n: int) -> np.ndarray:
+        """The gradient that it is meant for."""
+        return closed_form(n, discounted=self.discounted)
 
-def _wrong_critic_rung(lambda_: float) -> Rung:
-    def advantage(p):
-        return estimators.td_lambda(p.reward, p.discount, p.wrong_value, p.wrong_next_value, lambda_).advantage
-
-    def mean(n):
-        following = lambda_targets(problem(n), policy(n), wrong_critic(n), lambda_)
-        return closed_form(n, following=following, discounted=False)
-
-    return Rung(advantage, mean)
+    def mean(self, n: int) -> np.ndarray:
+        """The mean that theory gives it."""
+        return self.biased_mean(n) if self.biased_mean else self.target(n)
 
 
 def _with_factors(advantage):
-    return lambda p: discount_factors(p.discount) * advantage(p)
+    return Rung(lambda p: discount_factors(p.discount) * advantage(p), discounted=True)
+
+
+def _wrong_critic_rung(lambda_):
+    return Rung(with_wrong_critic(lambda_), biased_mean=lambda n: wrong_critic_mean(n, lambda_))
 
 
 LADDER = {
-    **{name: Rung(advantage, lambda n: closed_form(n, discounted=False)) for name, advantage in UNBIASED.items()},
-    "whole return": Rung(lambda p: estimators.reinforce_whole(p.reward, p.discount).advantage, closed_form),
-    "returns, gamma^t": Rung(_with_factors(UNBIASED["returns"]), closed_form),
-    "returns, value, gamma^t": Rung(_with_factors(UNBIASED["returns, value"]), closed_form),
+    **{name: Rung(advantage) for name, advantage in UNBIASED.items()},
+    "whole return": Rung(lambda p: estimators.reinforce_whole(p.reward, p.discount).advantage, discounted=True),
+    "returns, gamma^t": _with_factors(UNBIASED["returns"]),
+    "returns, value, gamma^t": _with_factors(UNBIASED["returns, value"]),
     "td_zero, wrong critic": _wrong_critic_rung(0.0),
     "td_lambda 0.5, wrong critic": _wrong_critic_rung(0.5),
     "td_lambda 0.9, wrong critic": _wrong_critic_rung(0.9),
 }
-
-
-class Moments(NamedTuple):
-    """Of an estimator's samples: their number, and mean and variance of each component."""
-
-    count: int
-    mean: np.ndarray
-    variance: np.ndarray
-
-    def errors(self, expected: np.ndarray) -> np.ndarray:
-        """How many standard errors the mean is away, in each component."""
-        return (self.mean - expected) / np.sqrt(self.variance / self.count)
 
 
 def measure(n: int, num_batches: int, batch_size: int = 50_000) -> dict[str, Moments]:
@@ -218,7 +239,7 @@ def measure(n: int, num_batches: int, batch_size: int = 50_000) -> dict[str, Mom
     """
     sums = {name: [0.0, 0.0] for name in LADDER}
     for seed in range(num_batches):
-        played = play.__wrapped__(n, batch_size, seed)
+        played = simulate(n, batch_size, seed)
         for name, rung in LADDER.items():
             found = samples(played, rung.advantage)
             sums[name][0] += found.sum(0)

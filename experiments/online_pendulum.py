@@ -18,14 +18,13 @@ from __future__ import annotations
 import json
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from commands import RESULTS, write_json
 from matplotlib.figure import Figure
 
 from jaxpg.run.config import compose
 from jaxpg.run.figures import draw_curve
-from jaxpg.run.program import make_algorithm, make_env, plan
+from jaxpg.run.program import agent_keys, make_algorithm, make_env, plan
 from jaxpg.run.statistics import interquartile_mean
 from jaxpg.training import train_scan
 
@@ -39,16 +38,15 @@ SIZES: tuple[str, ...] = ()  # options for all runs
 
 def returns(*options: str) -> tuple[np.ndarray, np.ndarray]:
     """Steps `[K]` and mean return of the episodes that ended since the last point, `[S, K]`."""
-    config = compose(["env=pendulum", "algo=online", *SIZES, *options])
+    config = compose(["env=pendulum", "algo=online", f"num_seeds={NUM_SEEDS}", *SIZES, *options])
     algorithm, schedule = make_algorithm(config, make_env(config)), plan(config)
-    keys = jnp.stack([jax.random.key(seed) for seed in range(NUM_SEEDS)])
-    _, metrics = jax.jit(jax.vmap(lambda key: train_scan(algorithm, key, schedule.num_updates)))(keys)
-    points = min(POINTS, schedule.num_updates)
-    ends = np.linspace(0, schedule.num_updates, points + 1).astype(int)[1:]
-    total = np.cumsum(metrics["return_sum"], axis=1, dtype=float)[:, ends - 1]
-    episodes = np.cumsum(metrics["episodes"], axis=1, dtype=float)[:, ends - 1]
-    earned = np.diff(total, axis=1, prepend=0) / np.maximum(np.diff(episodes, axis=1, prepend=0), 1)
-    return ends * schedule.steps_per_update, earned
+    train = jax.vmap(lambda key: train_scan(algorithm, key, schedule.num_updates))
+    _, metrics = jax.jit(train)(agent_keys(config))
+    ends = np.linspace(0, schedule.num_updates, min(POINTS, schedule.num_updates) + 1).astype(int)
+    total, episodes = (
+        np.add.reduceat(np.asarray(metrics[name], float), ends[:-1], axis=1) for name in ("return_sum", "episodes")
+    )
+    return ends[1:] * schedule.steps_per_update, total / np.maximum(episodes, 1)
 
 
 def main() -> None:

@@ -171,6 +171,12 @@ def linear_networks(
     return _networks(actor, critic, lambda obs: FEATURES[features](obs, order), observation_size, distribution)
 
 
+def linear_mean(actor: PyTree) -> tuple[jax.Array, jax.Array]:
+    """W `[action_size, features]` and b `[action_size]` of the parameters `params["actor"]` of `linear_networks`."""
+    layer = actor["params"]["MLP_0"]["Dense_0"]
+    return layer["kernel"].T, layer["bias"]
+
+
 def _networks(actor, critic, phi, observation_size: int, distribution: Distribution) -> Networks:
     """The flax modules, applied to phi(s), as pure functions."""
 

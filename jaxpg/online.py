@@ -5,6 +5,7 @@ The lesson's online update (sections 4.1, 7 and 8.1), with traces; of any networ
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import NamedTuple
 
 import jax
@@ -15,6 +16,7 @@ from jaxpg.actor_critic import sampling_policy
 from jaxpg.networks import Networks
 from jaxpg.returns import td_errors
 from jaxpg.rollout import rollout
+from jaxpg.shapes import along
 from jaxpg.types import Algorithm, Metrics, PyTree, TrainState, Transition
 from jaxpg.vector_env import VectorEnv, stagger
 
@@ -88,61 +90,79 @@ def online_actor_critic(
         normalizer = normalization.init(env.observation_size)
         return TrainState(params, no_traces(params), normalizer, env_state, jnp.zeros((), jnp.int32))
 
-    def learn(params: PyTree, traces: Traces, normalizer: PyTree, step: Transition) -> tuple[PyTree, Traces, Metrics]:
-        """The update above, of one step `[N, ...]` of each environment."""
-        obs = normalization.normalize(normalizer, step.obs)
-        next_obs = normalization.normalize(normalizer, step.next_obs)
-
-        def log_prob(actor, obs, u):
-            mean, log_std = networks.policy(actor, obs)
-            return networks.distribution.log_prob(u, mean, log_std), jnp.exp(log_std)
-
-        value, value_gradient = _each(jax.value_and_grad(networks.value))(params["critic"], obs)
-        score, sigma = _each(jax.grad(log_prob, has_aux=True))(params["actor"], obs, step.u)
-        discount = gamma * (1 - step.terminated)
-        delta = td_errors(reward_scale * step.reward, discount, value, networks.value(params["critic"], next_obs))
-        z_critic = jax.tree.map(lambda z, g: gamma * lambda_critic * z + g, traces.critic, value_gradient)
-        z_actor = jax.tree.map(
-            lambda z, g: gamma * lambda_actor * z + _along(traces.factor, g) * g, traces.actor, score
-        )
-
-        def ascend(x, z, step_size):
-            return x + step_size * jnp.mean(_along(delta, z) * z, axis=0)
-
-        params = {
-            "actor": jax.tree.map(lambda x, z: ascend(x, z, actor_lr), params["actor"], z_actor),
-            "critic": jax.tree.map(lambda x, z: ascend(x, z, critic_lr), params["critic"], z_critic),
-        }
-        goes_on = 1 - jnp.maximum(step.terminated, step.truncated)
-        z_actor, z_critic = jax.tree.map(lambda z: _along(goes_on, z) * z, (z_actor, z_critic))
-        factor = jnp.where(goes_on > 0, (gamma if discounted else 1.0) * traces.factor, 1.0)
-        metrics = {
-            "td_error": jnp.mean(jnp.abs(delta)),
-            "value": jnp.mean(value),
-            "sigma": jnp.mean(sigma),
-            "return_sum": jnp.sum(step.episode_return),
-            "episodes": jnp.sum(step.episode_end),
-        }
-        return params, Traces(z_actor, z_critic, factor), metrics
+    update = trace_update(networks, gamma, lambda_actor, lambda_critic, actor_lr, critic_lr, reward_scale, discounted)
 
     def step(state: TrainState, key: jax.Array) -> tuple[TrainState, Metrics]:
         def one(carry, key):
             params, traces, env_state = carry
             policy_fn = sampling_policy(networks, params, state.normalizer)
             env_state, transition = rollout(policy_fn, env.step, env_state, key, length=1)
-            params, traces, metrics = learn(params, traces, state.normalizer, jax.tree.map(lambda x: x[0], transition))
-            return (params, traces, env_state), (transition.obs[0], metrics)
+            transition = jax.tree.map(lambda x: x[0], transition)
+            params, traces, metrics = update(params, traces, state.normalizer, transition)
+            return (params, traces, env_state), (transition, metrics)
 
         carry = state.params, state.opt_state, state.env_state
-        (params, traces, env_state), (obs, metrics) = jax.lax.scan(one, carry, jax.random.split(key, num_steps))
+        (params, traces, env_state), (transition, metrics) = jax.lax.scan(one, carry, jax.random.split(key, num_steps))
         normalizer = state.normalizer
         if normalize_observations:
-            normalizer = normalization.update(normalizer, obs)
-        summed = ("return_sum", "episodes")
-        metrics = {name: (jnp.sum if name in summed else jnp.mean)(x) for name, x in metrics.items()}
+            normalizer = normalization.update(normalizer, transition.obs)
+        metrics = jax.tree.map(jnp.mean, metrics) | {
+            "return_sum": jnp.sum(transition.episode_return),
+            "episodes": jnp.sum(transition.episode_end),
+        }
         return TrainState(params, traces, normalizer, env_state, state.update + 1), metrics
 
     return Algorithm(init, step)
+
+
+def trace_update(
+    networks: Networks,
+    gamma: float,
+    lambda_actor: float,
+    lambda_critic: float,
+    actor_lr: float,
+    critic_lr: float,
+    reward_scale: float,
+    discounted: bool,
+) -> Callable[[PyTree, Traces, PyTree, Transition], tuple[PyTree, Traces, Metrics]]:
+    """`update(params, traces, normalizer, transition) -> (params, traces, metrics)`: the one of `online_actor_critic`.
+
+    Args:
+      networks, gamma, lambda_actor, lambda_critic, actor_lr, critic_lr, reward_scale, discounted: as there.
+
+    The transition is one step of each environment, `[N, ...]`.
+    """
+
+    def log_prob(actor, obs, u):
+        mean, log_std = networks.policy(actor, obs)
+        return networks.distribution.log_prob(u, mean, log_std), jnp.exp(log_std)
+
+    def update(params, traces, normalizer, transition):
+        obs = normalization.normalize(normalizer, transition.obs)
+        next_obs = normalization.normalize(normalizer, transition.next_obs)
+        value, value_gradient = _each(jax.value_and_grad(networks.value))(params["critic"], obs)
+        score, sigma = _each(jax.grad(log_prob, has_aux=True))(params["actor"], obs, transition.u)
+        discount = gamma * (1 - transition.terminated)
+        next_value = networks.value(params["critic"], next_obs)
+        delta = td_errors(reward_scale * transition.reward, discount, value, next_value)
+        z_critic = jax.tree.map(lambda z, g: gamma * lambda_critic * z + g, traces.critic, value_gradient)
+        z_actor = jax.tree.map(lambda z, g: gamma * lambda_actor * z + along(traces.factor, g) * g, traces.actor, score)
+        params = {
+            "actor": _ascend(params["actor"], actor_lr, delta, z_actor),
+            "critic": _ascend(params["critic"], critic_lr, delta, z_critic),
+        }
+        goes_on = 1 - jnp.maximum(transition.terminated, transition.truncated)
+        z_actor, z_critic = jax.tree.map(lambda z: along(goes_on, z) * z, (z_actor, z_critic))
+        factor = jnp.where(goes_on > 0, (gamma if discounted else 1.0) * traces.factor, 1.0)
+        metrics = {"td_error": jnp.mean(jnp.abs(delta)), "value": jnp.mean(value), "sigma": jnp.mean(sigma)}
+        return params, Traces(z_actor, z_critic, factor), metrics
+
+    return update
+
+
+def _ascend(params: PyTree, step_size: float, delta: jax.Array, traces: PyTree) -> PyTree:
+    """params + step_size delta z, the mean over the environments."""
+    return jax.tree.map(lambda x, z: x + step_size * jnp.mean(along(delta, z) * z, axis=0), params, traces)
 
 
 def _each(function):
@@ -152,8 +172,3 @@ def _each(function):
         return jax.vmap(lambda *rows: function(params, *rows))(*arrays)
 
     return apply
-
-
-def _along(x: jax.Array, like: jax.Array) -> jax.Array:
-    """`[N]` with as many axes as `like`, `[N, ...]`."""
-    return x.reshape(x.shape + (1,) * (like.ndim - 1))

@@ -34,6 +34,15 @@ def spread(x: jax.Array | float, reference: jax.Array, name: str) -> jax.Array:
     return jnp.broadcast_to(x, reference.shape)
 
 
+def along(x: jax.Array, reference: jax.Array) -> jax.Array:
+    """`x`, `[N]`, with as many axes as the reference, `[N, ...]`: one number for each of its rows.
+
+    >>> along(jnp.ones(3), jnp.ones((3, 2, 4))).shape
+    (3, 1, 1)
+    """
+    return x.reshape(x.shape + (1,) * (reference.ndim - 1))
+
+
 def same(x: jax.Array, reference: jax.Array, name: str) -> jax.Array:
     """`x`, which must have the reference's shape; raises ValueError where it has another."""
     if x.shape != reference.shape:

@@ -13,6 +13,8 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
+from jaxpg.shapes import along
+
 
 class VectorState(NamedTuple):
     """N running episodes.
@@ -109,6 +111,6 @@ def _select(mask: jax.Array, if_true: Any, if_false: Any) -> Any:
     """Leaf by leaf along the leading axis: `if_true` where the mask holds."""
 
     def select(a, b):
-        return jnp.where(mask.reshape(mask.shape + (1,) * (b.ndim - 1)), a, b)
+        return jnp.where(along(mask, b), a, b)
 
     return jax.tree.map(select, if_true, if_false)

@@ -28,6 +28,7 @@ def configured(*options):
 
 @pytest.mark.parametrize(
     ("algo", "option"),
+    # Each compiles three programs: every second one in the quick run, the others in the study.
     [row if i % 2 else pytest.param(*row, marks=pytest.mark.study) for i, row in enumerate(LADDER)],
     ids=NAMES,
 )

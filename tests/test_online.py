@@ -9,7 +9,7 @@ import pytest
 
 from envs.quadratic import LinearQuadratic, QuadraticConfig, chain
 from jaxpg.distributions import GAUSSIAN
-from jaxpg.networks import linear_networks, mlp_networks
+from jaxpg.networks import linear_mean, linear_networks, mlp_networks
 from jaxpg.online import online_actor_critic
 from jaxpg.training import initial_state, train_scan
 from jaxpg.vector_env import vectorize
@@ -80,9 +80,9 @@ def noted(batch, log):
 
 
 def unpacked(params):
-    actor, critic = params["actor"]["params"], params["critic"]["params"]["Dense_0"]
-    dense = actor["MLP_0"]["Dense_0"]
-    arrays = dense["kernel"].T, dense["bias"], actor["log_std"], critic["kernel"][:, 0], critic["bias"][0]
+    critic = params["critic"]["params"]["Dense_0"]
+    log_std = params["actor"]["params"]["log_std"]
+    arrays = *linear_mean(params["actor"]), log_std, critic["kernel"][:, 0], critic["bias"][0]
     return [np.asarray(x, np.float64) for x in arrays]
 
 

@@ -22,6 +22,7 @@ from envs.quadratic import (
     state_moments,
     values,
 )
+from jaxpg.networks import linear_mean
 from jaxpg.rollout import rollout
 from jaxpg.run.config import compose
 from jaxpg.run.program import make_algorithm, make_env, plan
@@ -191,7 +192,7 @@ def test_default_training_finds_the_best_gain():
     config = compose(["env=quadratic", "algo=reinforce"])
     algorithm = make_algorithm(config, make_env(config))
     state, _ = jax.jit(lambda key: train_scan(algorithm, key, plan(config).num_updates))(jax.random.key(0))
-    layer = state.params["actor"]["params"]["MLP_0"]["Dense_0"]
-    policy = Policy(np.asarray(layer["kernel"], np.float64).T, np.asarray(layer["bias"], np.float64), 0.5)
+    K, k = (np.asarray(x, np.float64) for x in linear_mean(state.params["actor"]))
+    policy = Policy(K, k, 0.5)
     problem = chain(config.env)
     assert objective(problem, policy) / objective(problem, best_policy(problem, 0.5)) < 1.02

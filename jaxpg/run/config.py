@@ -99,13 +99,17 @@ def compose(arguments: Sequence[str]) -> Config:
       OptionError, UserError: every unknown name, wrong type and value out of range; or text that is no override.
     """
     given = parse(arguments)
-    chosen = {group: value for group, value in given.items() if group in GROUPS}
-    tuned = _tuned(DEFAULT_CHOICES | chosen)
-    choices = DEFAULT_CHOICES | {group: value for group, value in tuned.items() if group in GROUPS} | chosen
+    tuned = _tuned(DEFAULT_CHOICES | _members(given))
+    choices = DEFAULT_CHOICES | _members(tuned) | _members(given)
     _check_names(given, choices)
     fields = option_fields(choices)
     values = {name: value for name, value in (tuned | given).items() if name in fields}
     return from_dict(_hydra_compose(choices, values))
+
+
+def _members(values: Mapping[str, Any]) -> dict[str, Any]:
+    """Those of the values that choose a member of a group."""
+    return {name: value for name, value in values.items() if name in GROUPS}
 
 
 def _tuned(choices: Mapping[str, Any]) -> Mapping[str, Any]:
@@ -229,7 +233,7 @@ def change(config: Config, changes: Mapping[str, Any]) -> Config:
     Raises:
       OptionError: an unknown name, another member of a group, a wrong type or a value out of range.
     """
-    _check_names(changes, config.choices | {name: value for name, value in changes.items() if name in GROUPS})
+    _check_names(changes, config.choices | _members(changes))
     others = [name for name in GROUPS if changes.get(name, config.choices[name]) != config.choices[name]]
     if others:
         raise OptionError([f"{name}={changes[name]}: the run has {name}={config.choices[name]}" for name in others])

@@ -95,16 +95,15 @@ def make_env(config: Config) -> Any:
     """The environment; raises OptionError where it has a mistake to report, or where the features do not fit it."""
     env = envs.REGISTRY[config.choices["env"]].build(config.env)
     if config.choices["network"] == "linear":
-        network = config.network
-        number = num_features(network.features, env.observation_size, network.order)
-        if number > MAX_FEATURES:
-            raise OptionError(
-                [
-                    f"network.features={network.features} network.order={network.order}: {number:,} features of "
-                    f"{env.observation_size} observations; at most {MAX_FEATURES:,}"
-                ]
-            )
+        _check_features(config.network, env.observation_size)
     return env
+
+
+def _check_features(network: Any, observation_size: int) -> None:
+    number = num_features(network.features, observation_size, network.order)
+    if number > MAX_FEATURES:
+        name = f"network.features={network.features} network.order={network.order}"
+        raise OptionError([f"{name}: {number:,} features of {observation_size} observations; at most {MAX_FEATURES:,}"])
 
 
 def make_networks(config: Config, env: Any) -> Networks:

@@ -16,18 +16,24 @@ from jaxpg.networks import ACTIVATIONS, SIGMAS
 
 
 @dataclass(frozen=True)
-class Learning:
-    """Options that TD and REINFORCE share."""
+class Common:
+    """Options that all algorithms share."""
 
     gamma: float = option(0.99, "discount", at_least=0, at_most=1)
+    reward_scale: float = option(1.0, "factor on the rewards that are learned from", above=0)
+    normalize_observations: bool = option(True, "observations with running mean 0 and deviation 1")
+
+
+@dataclass(frozen=True)
+class Learning(Common):
+    """Options that TD and REINFORCE share."""
+
     actor_lr: float = option(0.002, "Adam step size of the actor", above=0)
     critic_lr: float = option(0.004, "Adam step size of the critic", above=0)
     final_lr: float = option(0.1, "step sizes fall linearly to this fraction", at_least=0, at_most=1)
     max_gradient_norm: float = option(1.0, "longer gradients are shortened to this", above=0)
-    reward_scale: float = option(1.0, "factor on the rewards that are learned from", above=0)
     entropy_coef: float = option(0.0, "weight of the entropy bonus", at_least=0)
     normalize_advantages: bool = option(True, "advantages with mean 0 and deviation 1 over the batch")
-    normalize_observations: bool = option(True, "observations with running mean 0 and deviation 1")
 
 
 @dataclass(frozen=True)
@@ -49,19 +55,16 @@ class Reinforce(Learning):
 
 
 @dataclass(frozen=True)
-class Online:
+class Online(Common):
     """Per-step actor-critic: after every step, plain steps along eligibility traces."""
 
-    gamma: float = option(0.99, "discount", at_least=0, at_most=1)
     lambda_actor: float = option(
         0.9, "decay of the actor's trace; 0 is the gradient of the step alone", at_least=0, at_most=1
     )
     lambda_critic: float = option(0.9, "decay of the critic's trace", at_least=0, at_most=1)
     actor_lr: float = option(0.001, "step size of the actor", above=0)
     critic_lr: float = option(0.005, "step size of the critic", above=0)
-    reward_scale: float = option(1.0, "factor on the rewards that are learned from", above=0)
     discounted: bool = option(False, "the actor's gradient times gamma^t")
-    normalize_observations: bool = option(True, "observations with running mean 0 and deviation 1")
 
 
 @dataclass(frozen=True)
