@@ -1,7 +1,8 @@
-"""Trajectories of random linear-quadratic problems, the ladder of estimators on them, and what theory says of each.
+"""The linear-quadratic problem played, and every estimator of the ladder on it next to the mean that theory gives it.
 
-Shared by the tests and by `estimator_table.py`. Trajectories are played by numpy in float64. Of each one the estimate
-sum_t score_t A_t of the gradient in K, k and log sigma is a sample; the samples' mean is held against closed forms.
+A trajectory is a polynomial in its standard normal noises z, `[n + T (m + n)]`: those of s_0, a_0, s_1, a_1, ..., s_T.
+So `play` serves samples and quadrature alike. For each trajectory the estimate sum_t score_t A_t of the gradient in K,
+k and log sigma is one sample. All is numpy in float64, but for the estimators themselves.
 """
 
 from __future__ import annotations
@@ -14,12 +15,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from envs.quadratic import Policy, Problem, gradient, lambda_targets, values
+from envs.quadratic import Policy, Problem, Quadratic, backup, gradient, lambda_targets, values
 from jaxpg import baselines, estimators
 from jaxpg.returns import discount_factors, discounted_returns
 
 
-def random_problem(seed, n, m, horizon=6, discount=0.9):
+def random_problem(seed: int, n: int, m: int, horizon: int = 6, discount: float = 0.9) -> Problem:
     random = np.random.default_rng(seed)
 
     def covariance(size):
@@ -39,18 +40,37 @@ def random_problem(seed, n, m, horizon=6, discount=0.9):
     )
 
 
-def random_policy(seed, problem):
+def random_policy(seed: int, problem: Problem) -> Policy:
     random = np.random.default_rng(seed + 1)
     n, m = problem.B.shape
     return Policy(0.3 * random.normal(size=(m, n)), random.normal(size=m), 0.4)
 
 
+class Setting(NamedTuple):
+    """A problem, the policy that plays, its values V_0 ... V_T, and those of quite another policy."""
+
+    problem: Problem
+    policy: Policy
+    critic: list[Quadratic]
+    wrong_critic: list[Quadratic]
+
+
+@functools.cache
+def setting(n: int, horizon: int = 5) -> Setting:
+    """With n state and min(n, 2) action variables."""
+    problem = random_problem(seed=n, n=n, m=min(n, 2), horizon=horizon, discount=0.8)
+    policy = random_policy(n, problem)
+    return Setting(problem, policy, values(problem, policy), values(problem, random_policy(77, problem)))
+
+
 class Played(NamedTuple):
-    """`[T, N, ...]`; the critics' values are exact (`value`) and those of another policy (`wrong_value`).
+    """`[T, N, ...]`; `value` is that of the exact critic, `wrong_value` that of the wrong one.
 
     `beyond` is `next_value` as if the last step were not the last one.
     """
 
+    state: np.ndarray
+    noise: np.ndarray
     reward: np.ndarray
     discount: np.ndarray
     score: np.ndarray
@@ -59,193 +79,200 @@ class Played(NamedTuple):
     beyond: np.ndarray
     wrong_value: np.ndarray
     wrong_next_value: np.ndarray
-    noise: np.ndarray
-    state: np.ndarray
 
 
-@functools.cache
-def problem(n):
-    return random_problem(seed=n, n=n, m=min(n, 2), horizon=5, discount=0.8)
+def num_noises(setting: Setting) -> int:
+    n, m = setting.problem.B.shape
+    return n + setting.problem.horizon * (m + n)
 
 
-@functools.cache
-def policy(n):
-    return random_policy(n, problem(n))
-
-
-@functools.cache
-def wrong_critic(n):
-    """The values of quite another policy."""
-    return values(problem(n), random_policy(77, problem(n)))
-
-
-def simulate(n, num_trajectories, seed):
-    case, (K, k, sigma), random = problem(n), policy(n), np.random.default_rng(seed)
-    exact, wrong = values(case, policy(n)), wrong_critic(n)
-
-    def noise(covariance):
-        return random.normal(size=(num_trajectories, len(covariance))) @ np.linalg.cholesky(covariance).T
-
-    s = case.initial_mean + noise(case.initial_covariance)
-    steps = []
-    for t in range(case.horizon):
-        epsilon = random.normal(size=(num_trajectories, len(k)))
+def play(setting: Setting, z: np.ndarray) -> Played:
+    """The trajectories of the standard normal noises `z`, `[N, num_noises]`."""
+    problem, (K, k, sigma), exact, wrong = setting
+    n, m = problem.B.shape
+    z0, *later = np.split(z, np.cumsum([n, *[m, n] * problem.horizon])[:-1], axis=1)
+    s = problem.initial_mean + z0 @ np.linalg.cholesky(problem.initial_covariance).T
+    root, steps = np.linalg.cholesky(problem.W).T, []
+    for t in range(problem.horizon):
+        epsilon, last = later[2 * t], t == problem.horizon - 1
         a = s @ K.T + k + sigma * epsilon
-        following = s @ case.A.T + a @ case.B.T + noise(case.W)
-        cost = np.einsum("ni,ij,nj->n", following, case.Q, following) + np.einsum("ni,ij,nj->n", a, case.R, a)
+        following = s @ problem.A.T + a @ problem.B.T + later[2 * t + 1] @ root
+        cost = np.sum(following @ problem.Q * following, axis=1) + np.sum(a @ problem.R * a, axis=1)
         in_mean = epsilon / sigma
-        in_K = (in_mean[:, :, None] * s[:, None, :]).reshape(num_trajectories, -1)
+        in_K = (in_mean[:, :, None] * s[:, None, :]).reshape(len(z), -1)
         in_log_sigma = np.sum(epsilon**2 - 1, axis=1, keepdims=True)
-        score = np.concatenate([in_K, in_mean, in_log_sigma], axis=1)
-        last = t == case.horizon - 1
         steps.append(
             Played(
+                state=s,
+                noise=epsilon,
                 reward=-cost,
-                discount=np.full(num_trajectories, 0.0 if last else case.discount),
-                score=score,
+                discount=np.full(len(z), 0.0 if last else problem.discount),
+                score=np.concatenate([in_K, in_mean, in_log_sigma], axis=1),
                 value=exact[t](s),
                 next_value=exact[t + 1](following),
                 beyond=exact[0 if last else t + 1](following),
                 wrong_value=wrong[t](s),
                 wrong_next_value=wrong[t + 1](following),
-                noise=epsilon[:, 0],
-                state=s,
             )
         )
         s = following
     return Played(*(np.stack(field) for field in zip(*steps, strict=True)))
 
 
-@functools.cache
-def play(n, num_trajectories=40_000, seed=0):
-    """`simulate`, once for all who ask for the same."""
-    return simulate(n, num_trajectories, seed)
-
-
-def flat(policy_like):
+def flat(policy_like: Policy) -> np.ndarray:
     return np.concatenate([policy_like.K.ravel(), policy_like.k, [policy_like.sigma]])
 
 
-def closed_form(n, **options):
-    return flat(gradient(problem(n), policy(n), **options))
+def closed_form(setting: Setting, following: list[Quadratic] | None = None, discounted: bool = True) -> np.ndarray:
+    """The gradient of J, or what `envs.quadratic.gradient` gives instead, as one vector."""
+    return flat(gradient(setting.problem, setting.policy, following, discounted))
 
 
-class Moments(NamedTuple):
-    """Of an estimator's samples: their number, and mean and variance of each component."""
-
-    count: int
-    mean: np.ndarray
-    variance: np.ndarray
-
-    def errors(self, expected: np.ndarray) -> np.ndarray:
-        """How many standard errors the mean is away, in each component."""
-        return (self.mean - expected) / np.sqrt(self.variance / self.count)
-
-
-def errors(samples, expected):
-    """How many standard errors the samples' mean is away, in each component."""
-    return Moments(len(samples), samples.mean(0), samples.var(0)).errors(expected)
+def n_step_targets(setting: Setting, critic: list[Quadratic], n: int) -> list[Quadratic]:
+    """E[G^(n-1)_{t+1} | s_{t+1}] for t = 0 ... T - 1: the critic at t + n or at the end, backed up to t + 1."""
+    horizon, found = setting.problem.horizon, []
+    for t in range(horizon):
+        end = min(t + n, horizon)
+        target = critic[end]
+        for _ in range(end - t - 1):
+            target = backup(setting.problem, setting.policy, target)
+        found.append(target)
+    return found
 
 
-def samples(played, advantage_of):
-    """sum_t score_t A_t of each trajectory, `[N, parameters]`."""
-    with jax.enable_x64(True):
-        advantage = np.asarray(advantage_of(jax.tree.map(jnp.asarray, played)))
-    return np.einsum("tnp,tn->np", played.score, advantage)
+def to_go(p: Played) -> jax.Array:
+    return discounted_returns(p.reward, p.discount, 0.0)
 
 
-def squared(score):
-    return jnp.sum(score**2, axis=-1)
+def squared_score(p: Played) -> jax.Array:
+    return jnp.sum(p.score**2, axis=-1)
 
 
-def to_go(played):
-    return discounted_returns(played.reward, played.discount, 0.0)
-
-
-def with_baseline(baseline_of):
+def with_baseline(baseline_of: Callable[[Played], jax.Array | float]) -> Callable[[Played], jax.Array]:
     return lambda p: estimators.reinforce(p.reward, p.discount, baseline_of(p)).advantage
 
 
-def with_wrong_critic(lambda_):
-    return lambda p: estimators.td_lambda(p.reward, p.discount, p.wrong_value, p.wrong_next_value, lambda_).advantage
-
-
+# All estimate sum_t E[score_t Q_t], and with the factors gamma^t the gradient of J.
 UNBIASED = {
     "returns": with_baseline(lambda p: 0.0),
     "returns, batch mean": with_baseline(lambda p: baselines.batch_mean(to_go(p))),
     "returns, time mean": with_baseline(lambda p: baselines.time_mean(to_go(p))),
     "returns, leave one out": with_baseline(lambda p: baselines.leave_one_out(to_go(p))),
-    "returns, optimal": with_baseline(lambda p: baselines.optimal(to_go(p), squared(p.score))),
+    "returns, optimal": with_baseline(lambda p: baselines.optimal(to_go(p), squared_score(p))),
     "returns, value": with_baseline(lambda p: p.value),
     "returns, wrong value": with_baseline(lambda p: p.wrong_value),
+    "n_step 3": lambda p: estimators.n_step(p.reward, p.discount, p.value, p.next_value, 3).advantage,
+    "td_lambda 0.7": lambda p: estimators.td_lambda(p.reward, p.discount, p.value, p.next_value, 0.7).advantage,
     "td_zero": lambda p: estimators.td_zero(p.reward, p.discount, p.value, p.next_value).advantage,
-    "n_step": lambda p: estimators.n_step(p.reward, p.discount, p.value, p.next_value, 3).advantage,
-    "td_lambda": lambda p: estimators.td_lambda(p.reward, p.discount, p.value, p.next_value, 0.7).advantage,
-    "td_lambda 1, wrong critic": with_wrong_critic(1.0),
+    "td_lambda 1, wrong critic": lambda p: (
+        estimators.td_lambda(p.reward, p.discount, p.wrong_value, p.wrong_next_value, 1.0).advantage
+    ),
 }
 
 
-def wrong_critic_mean(n, lambda_):
-    """The mean of the gradient by TD(lambda) with the wrong critic."""
-    following = lambda_targets(problem(n), policy(n), wrong_critic(n), lambda_)
-    return closed_form(n, following=following, discounted=False)
+class Biased(NamedTuple):
+    """`targets` has in the place of V_{t+1} what the advantage makes of the wrong critic on average."""
+
+    advantage: Callable[[Played], jax.Array]
+    targets: Callable[[Setting], list[Quadratic]]
+
+
+def td_lambda_with_wrong_critic(lambda_: float) -> Biased:
+    return Biased(
+        lambda p: estimators.td_lambda(p.reward, p.discount, p.wrong_value, p.wrong_next_value, lambda_).advantage,
+        lambda s: lambda_targets(s.problem, s.policy, s.wrong_critic, lambda_),
+    )
+
+
+BIASED = {
+    "n_step 3, wrong critic": Biased(
+        lambda p: estimators.n_step(p.reward, p.discount, p.wrong_value, p.wrong_next_value, 3).advantage,
+        lambda s: n_step_targets(s, s.wrong_critic, 3),
+    ),
+    "td_lambda 0.9, wrong critic": td_lambda_with_wrong_critic(0.9),
+    "td_lambda 0.5, wrong critic": td_lambda_with_wrong_critic(0.5),
+    "td_zero, wrong critic": Biased(
+        lambda p: estimators.td_zero(p.reward, p.discount, p.wrong_value, p.wrong_next_value).advantage,
+        lambda s: s.wrong_critic[1:],
+    ),
+}
 
 
 class Rung(NamedTuple):
-    """One estimator of the ladder.
-
-    Attributes:
-      advantage: what it makes of the trajectories.
-      discounted: whether it is meant for the gradient of J, or for the sum without the factors gamma^t.
-      biased_mean: the mean of its gradient on the problem with n variables; None where it is what it is meant for.
-    """
+    """An estimator as the sum of score_t A_t, factor gamma^t included where there is one, and its mean in theory."""
 
     advantage: Callable[[Played], jax.Array]
-    discounted: bool = False
-    biased_mean: Callable[[int], np.ndarray] | None = None
-
-    def target(self, n: int) -> np.ndarray:
-        """The gradient that it is meant for."""
-        return closed_form(n, discounted=self.discounted)
-
-    def mean(self, n: int) -> np.ndarray:
-        """The mean that theory gives it."""
-        return self.biased_mean(n) if self.biased_mean else self.target(n)
+    expected: np.ndarray
 
 
-def _with_factors(advantage):
-    return Rung(lambda p: discount_factors(p.discount) * advantage(p), discounted=True)
+def discounted(advantage: Callable[[Played], jax.Array]) -> Callable[[Played], jax.Array]:
+    return lambda p: discount_factors(p.discount) * advantage(p)
 
 
-def _wrong_critic_rung(lambda_):
-    return Rung(with_wrong_critic(lambda_), biased_mean=lambda n: wrong_critic_mean(n, lambda_))
+def ladder(setting: Setting) -> dict[str, Rung]:
+    """With the factors gamma^t, and the unbiased ones without them too: those estimate another sum than grad J."""
+    exact, without = closed_form(setting), closed_form(setting, discounted=False)
+    whole = Rung(lambda p: estimators.reinforce_whole(p.reward, p.discount).advantage, exact)
+    return (
+        {"whole return": whole}
+        | {name: Rung(discounted(advantage), exact) for name, advantage in UNBIASED.items()}
+        | {
+            name: Rung(discounted(advantage), closed_form(setting, targets(setting)))
+            for name, (advantage, targets) in BIASED.items()
+        }
+        | {f"{name}, no gamma^t": Rung(advantage, without) for name, advantage in UNBIASED.items()}
+    )
 
 
-LADDER = {
-    **{name: Rung(advantage) for name, advantage in UNBIASED.items()},
-    "whole return": Rung(lambda p: estimators.reinforce_whole(p.reward, p.discount).advantage, discounted=True),
-    "returns, gamma^t": _with_factors(UNBIASED["returns"]),
-    "returns, value, gamma^t": _with_factors(UNBIASED["returns, value"]),
-    "td_zero, wrong critic": _wrong_critic_rung(0.0),
-    "td_lambda 0.5, wrong critic": _wrong_critic_rung(0.5),
-    "td_lambda 0.9, wrong critic": _wrong_critic_rung(0.9),
-}
+def advantages(played: Played, advantage: Callable[[Played], jax.Array]) -> np.ndarray:
+    """A_t in float64, `[T, N]`."""
+    with jax.enable_x64(True), jax.disable_jit():  # a scan that runs once is not worth its compilation
+        return np.asarray(advantage(jax.tree.map(jnp.asarray, played)))
 
 
-def measure(n: int, num_batches: int, batch_size: int = 50_000) -> dict[str, Moments]:
-    """Moments of every estimator of the ladder over `num_batches` batches of trajectories, the same for all.
+def gradients(played: Played, advantage: Callable[[Played], jax.Array]) -> np.ndarray:
+    """sum_t score_t A_t of each trajectory, `[N, parameters]`."""
+    return np.einsum("tnp,tn->np", played.score, advantages(played, advantage))
 
-    Baselines that average over the batch see one batch at a time.
-    """
-    sums = {name: [0.0, 0.0] for name in LADDER}
-    for seed in range(num_batches):
-        played = simulate(n, batch_size, seed)
-        for name, rung in LADDER.items():
-            found = samples(played, rung.advantage)
-            sums[name][0] += found.sum(0)
-            sums[name][1] += (found**2).sum(0)
-    count = num_batches * batch_size
-    return {
-        name: Moments(count, total / count, squares / count - (total / count) ** 2)
-        for name, (total, squares) in sums.items()
-    }
+
+class Measured(NamedTuple):
+    """Of the samples of one estimator: how many there are, `[parameters]`, and `[parameters, parameters]`."""
+
+    number: int
+    mean: np.ndarray
+    covariance: np.ndarray
+
+    def errors(self, expected: np.ndarray) -> np.ndarray:
+        """How many standard errors the mean is away, in each component."""
+        return (self.mean - expected) / np.sqrt(np.diag(self.covariance) / self.number)
+
+
+def measure(samples: np.ndarray) -> Measured:
+    return Measured(len(samples), samples.mean(0), np.cov(samples.T))
+
+
+def study(
+    setting: Setting, rungs: dict[str, Rung], num_batches: int = 20, batch: int = 50_000, seed: int = 0
+) -> dict[str, Measured]:
+    """All the rungs on the same trajectories, 10^6 by default; sums in float64. Baselines average over one batch."""
+    random = np.random.default_rng(seed)
+
+    @jax.jit
+    def sums(played):
+        found = {}
+        for name, rung in rungs.items():
+            samples = jnp.einsum("tnp,tn->np", played.score, rung.advantage(played)) - rung.expected
+            found[name] = jnp.sum(samples, axis=0), samples.T @ samples
+        return found
+
+    total = dict.fromkeys(rungs, (0.0, 0.0))
+    with jax.enable_x64(True):
+        for _ in range(num_batches):
+            played = play(setting, random.normal(size=(batch, num_noises(setting))))
+            found = sums(jax.tree.map(jnp.asarray, played))
+            total = {name: tuple(map(np.add, total[name], found[name])) for name in rungs}
+    number, measured = num_batches * batch, {}
+    for name, (first, second) in total.items():
+        off = first / number
+        measured[name] = Measured(number, rungs[name].expected + off, second / number - np.outer(off, off))
+    return measured

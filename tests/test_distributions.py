@@ -66,6 +66,27 @@ def test_score_in_the_log_deviation():
     assert_close(score, (np.float64(u) - mean) ** 2 / np.exp(2 * np.float64(log_std)) - 1)
 
 
+@pytest.mark.parametrize("limit", [None, *LIMITS])
+def test_score_is_the_slope_of_central_differences(limit):
+    """Problem 3, plain and squashed: (f(x + h) - f(x - h)) / 2h is the score by hand to h^2 = 1e-10, in float64."""
+    h = 1e-5
+    with jax.enable_x64(True):
+        u, mean, log_std = (jnp.asarray(x, jnp.float64) for x in policy())
+
+        def log_prob(mean, log_std):
+            if limit is None:
+                return np.asarray(gaussian_log_prob(u, mean, log_std))
+            return np.asarray(squashed_gaussian_log_prob(u, mean, log_std, limit))
+
+        for i in range(3):  # one action's parameters at a time
+            step = h * jnp.eye(3)[i]
+            in_mean = (log_prob(mean + step, log_std) - log_prob(mean - step, log_std)) / (2 * h)
+            in_log_std = (log_prob(mean, log_std + step) - log_prob(mean, log_std - step)) / (2 * h)
+            standardized = np.asarray((u - mean) / jnp.exp(log_std))[:, i]
+            assert_close(in_mean, standardized / np.exp(log_std[:, i]), tolerance=1e-8)
+            assert_close(in_log_std, standardized**2 - 1, tolerance=1e-8)
+
+
 @pytest.mark.parametrize("shape", [(1,), (3,), (5, 3)])
 def test_entropy_is_scipys_summed_over_the_actions(shape):
     _, _, log_std = policy(shape)

@@ -5,9 +5,11 @@ import sys
 from pathlib import Path
 
 import jax
+import numpy as np
 import pytest
 
 EXPERIMENTS = Path(__file__).parent.parent / "experiments"
+SCRIPTS = [script.stem for script in EXPERIMENTS.glob("*.py")]
 
 
 @pytest.fixture
@@ -28,7 +30,7 @@ def experiments(monkeypatch, command_environment, tmp_path):
     monkeypatch.setattr(commands, "train", tiny)
     monkeypatch.setattr(commands, "RESULTS", tmp_path)
     yield tmp_path
-    for name in ("commands", "default_runs", "reinforce_and_td", "lesson_toy", "online_pendulum", "estimator_table"):
+    for name in SCRIPTS:
         sys.modules.pop(name, None)
 
 
@@ -97,3 +99,17 @@ def test_estimator_table(experiments, monkeypatch, capsys):
     assert capsys.readouterr().out.count("\n") == len(table) + 2
     assert max(row["errors"] for sizes in table.values() for row in sizes.values()) < 4
     assert table["td_zero, wrong critic"]["n = 3"]["bias"] > 0.5
+
+
+def test_gradient_variance(experiments, monkeypatch):
+    import gradient_variance
+
+    monkeypatch.setattr(gradient_variance, "RESULTS", experiments)
+    monkeypatch.setattr(gradient_variance, "NUM_EPISODES", 4096)
+    monkeypatch.setattr(gradient_variance, "BATCH_SIZES", (2, 64))
+    monkeypatch.setattr(gradient_variance, "LAMBDAS", np.array([0.0, 1.0]))
+    gradient_variance.main()
+    summary = json.loads((experiments / "gradient_variance.json").read_text())
+    assert summary["squared error x episodes"]["none"][1] > 3 * summary["squared error x episodes"]["value"][1]
+    assert summary["squared bias"][1] == 0
+    assert (experiments / "gradient_variance.png").read_bytes().startswith(b"\x89PNG")
