@@ -9,6 +9,12 @@ import time
 from pathlib import Path
 from typing import Any
 
+from matplotlib.axes import Axes
+
+from jaxpg.run.figures import draw_curve, series
+from jaxpg.run.folder import RunFolder, read_metrics
+from jaxpg.run.statistics import bootstrap_interval, interquartile_mean
+
 RESULTS = Path(__file__).parent / "results"
 
 
@@ -24,6 +30,21 @@ def evaluate(folder: Path, *arguments: str) -> dict[str, Any]:
     command = [sys.executable, "-m", "jaxpg.evaluate", f"run={folder}", "json=true", *arguments]
     output = subprocess.run(command, check=True, capture_output=True, text=True).stdout
     return json.loads(output.splitlines()[-1])
+
+
+def learning_curve(axes: Axes, folder: Path, metric: str, label: str) -> dict[str, Any]:
+    """Draws a metric of the run in `folder` over its steps; returns what was drawn, for `write_json`."""
+    steps, values = series(read_metrics(RunFolder(folder)), metric)
+    draw_curve(axes, steps, values, label)
+    low, high = bootstrap_interval(values)
+    return {
+        "metric": metric,
+        "seeds": len(values),
+        "steps": steps.tolist(),
+        "interquartile_mean": interquartile_mean(values).round(3).tolist(),
+        "low": low.round(3).tolist(),
+        "high": high.round(3).tolist(),
+    }
 
 
 def write_json(name: str, content: Any) -> None:

@@ -12,12 +12,8 @@ from __future__ import annotations
 import tempfile
 from pathlib import Path
 
-from commands import RESULTS, train, write_json
+from commands import RESULTS, learning_curve, train, write_json
 from matplotlib.figure import Figure
-
-from jaxpg.run.figures import draw_curve, series
-from jaxpg.run.folder import RunFolder, read_metrics
-from jaxpg.run.statistics import bootstrap_interval, interquartile_mean
 
 NUM_SEEDS = 5
 ALGORITHMS = {"td": "TD(lambda)", "reinforce": "REINFORCE, value baseline"}
@@ -37,17 +33,7 @@ def main() -> None:
             for algo, label in ALGORITHMS.items():
                 run = Path(folder) / f"{task}-{algo}"
                 train(run, f"env={task}", f"algo={algo}", f"num_seeds={NUM_SEEDS}", f"total_steps={total_steps}")
-                steps, values = series(read_metrics(RunFolder(run)), metric)
-                draw_curve(axes, steps, values, label)
-                low, high = bootstrap_interval(values)
-                summary[f"{task} {algo}"] = {
-                    "metric": metric,
-                    "seeds": NUM_SEEDS,
-                    "steps": steps.tolist(),
-                    "interquartile_mean": interquartile_mean(values).round(3).tolist(),
-                    "low": low.round(3).tolist(),
-                    "high": high.round(3).tolist(),
-                }
+                summary[f"{task} {algo}"] = learning_curve(axes, run, metric, label)
             axes.set(title=task, xlabel="environment steps", ylabel=ylabel)
             axes.grid(alpha=0.3)
             axes.legend(loc="lower right", fontsize=8)

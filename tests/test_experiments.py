@@ -61,6 +61,19 @@ def test_reinforce_and_td(experiments, monkeypatch):
     assert (experiments / "reinforce_and_td.png").read_bytes().startswith(b"\x89PNG")
 
 
+def test_sigma_choices(experiments, monkeypatch):
+    import sigma_choices
+
+    monkeypatch.setattr(sigma_choices, "NUM_SEEDS", 2)
+    monkeypatch.setattr(sigma_choices, "CHOICES", {"state": sigma_choices.CHOICES["of the state, from 1"]})
+    monkeypatch.setattr(sigma_choices, "RESULTS", experiments)
+    sigma_choices.main()
+    summary = json.loads((experiments / "sigma_choices.json").read_text())
+    assert summary["state"]["return"]["seeds"] == 2
+    assert summary["state"]["sigma"]["interquartile_mean"]
+    assert (experiments / "sigma_choices.png").read_bytes().startswith(b"\x89PNG")
+
+
 def test_lesson_toy(experiments, monkeypatch):
     import lesson_toy
 
