@@ -66,6 +66,30 @@ def gaussian_entropy(log_std: jax.Array) -> jax.Array:
     return jnp.sum(log_std + 0.5 * math.log(2 * math.pi * math.e), axis=-1)
 
 
+def gaussian_kl(old_mean: jax.Array, old_log_std: jax.Array, mean: jax.Array, log_std: jax.Array) -> jax.Array:
+    """Kullback-Leibler divergence of one Gaussian with independent components from another.
+
+        KL(old || new) = sum_i [ log(sigma_i / sigma'_i) + (sigma'_i^2 + (mu'_i - mu_i)^2) / (2 sigma_i^2) - 1/2 ]
+
+    with mu', sigma' the old ones. It is that of the squashed policies too: an invertible map changes both densities by
+    the same factor.
+
+    Args:
+      old_mean, mean: `[..., action_size]`.
+      old_log_std, log_std: log sigma, of shapes that broadcast to the means'.
+
+    Returns:
+      `[...]` in nats, at least 0.
+
+    Source: Kullback and Leibler (1951); the closed form is standard.
+
+    >>> gaussian_kl(jnp.zeros(1), jnp.zeros(1), jnp.ones(1), jnp.zeros(1)).item()
+    0.5
+    """
+    squared = jnp.exp(2 * (old_log_std - log_std)) + ((old_mean - mean) * jnp.exp(-log_std)) ** 2
+    return jnp.sum(log_std - old_log_std + 0.5 * squared - 0.5, axis=-1)
+
+
 def squash(u: jax.Array, limit: jax.Array | float = 1.0) -> jax.Array:
     """a = limit * tanh(u): any u into an actuator's limits.
 

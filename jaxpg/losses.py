@@ -36,6 +36,46 @@ def policy_gradient_loss(log_prob: jax.Array, advantage: jax.Array, weight: jax.
     return -jnp.mean(weight * log_prob * jax.lax.stop_gradient(same(advantage, log_prob, "advantage")))
 
 
+def clipped_surrogate_loss(
+    log_prob: jax.Array,
+    old_log_prob: jax.Array,
+    advantage: jax.Array,
+    clip: float | None,
+    weight: jax.Array | float = 1.0,
+) -> jax.Array:
+    """Surrogate for several gradient steps on the actions of one policy: PPO's.
+
+        L     = -mean(w_t min(rho_t A_t, clip(rho_t, 1 - epsilon, 1 + epsilon) A_t))
+        rho_t = pi(a_t | s_t) / pi_old(a_t | s_t)
+
+    Where pi is pi_old its gradient is that of `policy_gradient_loss`. A step whose ratio has left the interval in the
+    direction that its advantage asks for has no gradient any more.
+
+    Args:
+      log_prob: log pi(a_t | s_t), `[T, ...]`, differentiable.
+      old_log_prob: that of the policy which acted, `[T, ...]`; no gradient passes through it.
+      advantage: A_t, `[T, ...]`; no gradient passes through it.
+      clip: epsilon, positive; None leaves the ratio as it is.
+      weight: as in `policy_gradient_loss`.
+
+    Raises:
+      ValueError: the shapes differ.
+
+    Source: Schulman et al., arXiv 1707.06347, equation 7.
+
+    >>> log_prob, advantage = jnp.log(jnp.array([1.5, 1.5])), jnp.array([1.0, -1.0])
+    >>> round(clipped_surrogate_loss(log_prob, jnp.zeros(2), advantage, clip=0.2).item(), 3)  # of -1.2 and 1.5
+    0.15
+    """
+    weight = spread(weight, log_prob, "weight")
+    advantage = jax.lax.stop_gradient(same(advantage, log_prob, "advantage"))
+    ratio = jnp.exp(log_prob - jax.lax.stop_gradient(same(old_log_prob, log_prob, "old_log_prob")))
+    gain = ratio * advantage
+    if clip is not None:
+        gain = jnp.minimum(gain, jnp.clip(ratio, 1 - clip, 1 + clip) * advantage)
+    return -jnp.mean(weight * gain)
+
+
 def value_loss(value: jax.Array, target: jax.Array, weight: jax.Array | float = 1.0) -> jax.Array:
     """Half the mean squared error of the critic.
 
@@ -58,6 +98,35 @@ def value_loss(value: jax.Array, target: jax.Array, weight: jax.Array | float = 
     """
     weight = spread(weight, value, "weight")
     return 0.5 * jnp.mean(weight * (value - jax.lax.stop_gradient(same(target, value, "target"))) ** 2)
+
+
+def clipped_value_loss(
+    value: jax.Array, old_value: jax.Array, target: jax.Array, clip: float, weight: jax.Array | float = 1.0
+) -> jax.Array:
+    """`value_loss` of a critic that may move by `clip` only, or the plain one where that is larger.
+
+        L = 1/2 mean(w_t max((V - G)^2, (V_old + clip(V - V_old, -c, c) - G)^2)),    G = stop(target_t)
+
+    Args:
+      value: V(s_t), `[T, ...]`, differentiable.
+      old_value: that of the critic before the first step on this rollout, `[T, ...]`; no gradient passes through it.
+      target: `[T, ...]`; no gradient passes through it.
+      clip: c, positive, in units of the (scaled) return.
+      weight: as in `policy_gradient_loss`.
+
+    Raises:
+      ValueError: the shapes differ.
+
+    Source: practice (OpenAI's baselines); Andrychowicz et al., arXiv 2006.05990, found that it hurts.
+
+    >>> clipped_value_loss(jnp.array([3.0]), jnp.array([0.0]), jnp.array([3.0]), clip=1.0).item()
+    2.0
+    """
+    weight = spread(weight, value, "weight")
+    target = jax.lax.stop_gradient(same(target, value, "target"))
+    old_value = jax.lax.stop_gradient(same(old_value, value, "old_value"))
+    held = old_value + jnp.clip(value - old_value, -clip, clip)
+    return 0.5 * jnp.mean(weight * jnp.maximum((value - target) ** 2, (held - target) ** 2))
 
 
 def entropy_loss(entropy: jax.Array, weight: jax.Array | float = 1.0) -> jax.Array:

@@ -10,7 +10,20 @@ import pytest
 from probes import Constant, Counter, Target
 
 from jaxpg import normalization
-from jaxpg.actor_critic import BASELINES, Method, actor_critic, deterministic_policy, reinforce, sampling_policy, td
+from jaxpg.actor_critic import (
+    BASELINES,
+    Method,
+    Reuse,
+    actor_critic,
+    actor_critic_loss,
+    batch_of,
+    deterministic_policy,
+    reinforce,
+    sampling_policy,
+    several_steps,
+    shuffled_parts,
+    td,
+)
 from jaxpg.estimators import td_lambda
 from jaxpg.evaluation import evaluate
 from jaxpg.networks import mlp_networks
@@ -185,6 +198,90 @@ def test_policy_is_not_moved_by_the_critics_error():
     assert float(metrics["value_loss"]) > 0
     moved = jax.tree.map(operator.ne, before.params["critic"], after.params["critic"])
     assert any(bool(leaf.any()) for leaf in jax.tree.leaves(moved))
+
+
+def test_one_unclipped_step_of_ppo_is_td():
+    """The surrogate's gradient at a ratio of 1 is the policy gradient; to rounding of the ratio."""
+    _, once = make(Counter(), td(0.9, 0.95, 4))
+    _, reused = make(Counter(), td(0.9, 0.95, 4), reuse=Reuse(epochs=1, minibatches=1, clip=None))
+    left, right = (jax.jit(lambda key, a=a: train_scan(a, key, 20))(new_key())[0] for a in (once, reused))
+    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-4, atol=1e-6), left.params, right.params)
+    _, again = make(Counter(), td(0.9, 0.95, 4), reuse=Reuse(epochs=2, minibatches=1, clip=None))
+    other, _ = jax.jit(lambda key: train_scan(again, key, 20))(new_key())
+    assert max(abs(a - b).max() for a, b in zip(*map(jax.tree.leaves, (left.params, other.params)), strict=True)) > 1e-3
+
+
+def a_batch(networks, params, num_envs=6, method=None):
+    """The first rollout on `Counter`, ready for the losses."""
+    method = method or td(0.9, 0.95, 5)
+    vector, statistics = vectorize(Counter(), num_envs, 10), normalization.init(2)
+    policy_fn = sampling_policy(networks, params, statistics)
+    _, steps = method.collect(vector, policy_fn, vector.reset(new_key()), jax.random.key(1))
+    return batch_of(networks, method, 1.0, True)(params, statistics, steps)
+
+
+@pytest.mark.parametrize("minibatches", [1, 2, 3])
+def test_parts_hold_every_environment_once(minibatches):
+    networks, _ = make(Counter(), td(0.9, 0.95, 5))
+    batch = a_batch(networks, networks.init(new_key()))
+    number = jnp.broadcast_to(jnp.arange(6.0), (5, 6))
+    seen = set()
+    for seed in range(8):
+        parts = shuffled_parts(batch._replace(advantage=number, u=number[..., None]), new_key(seed), minibatches)
+        assert parts.advantage.shape == (minibatches, 5, 6 // minibatches)
+        np.testing.assert_array_equal(parts.advantage, parts.u[..., 0])  # all fields in the same order
+        np.testing.assert_array_equal(
+            parts.advantage, parts.advantage[:, :1] + jnp.zeros((5, 1))
+        )  # steps stay together
+        np.testing.assert_array_equal(np.sort(parts.advantage[:, 0].ravel()), np.arange(6))
+        seen.add(tuple(parts.advantage[:, 0].ravel().tolist()))
+    assert len(seen) > 1  # another order in another epoch
+
+
+def steps_taken(reuse):
+    """Parameters after the reuse of one rollout, plain gradient steps of 0.5, and the metrics; the same by a loop."""
+    networks, _ = make(Counter(), td(0.9, 0.95, 5))
+    params, optimizer = networks.init(new_key()), optax.sgd(0.5)
+    batch, loss = a_batch(networks, params), actor_critic_loss(networks, 0.01, reuse)
+    found, _, metrics = jax.jit(several_steps(loss, optimizer, reuse))(
+        params, optimizer.init(params), batch, new_key(3)
+    )
+    by_loop, divergence = params, []
+    for key in jax.random.split(new_key(3), reuse.epochs):
+        parts = shuffled_parts(batch, key, reuse.minibatches)
+        for i in range(reuse.minibatches):
+            slope, terms = jax.grad(loss, has_aux=True)(by_loop, jax.tree.map(operator.itemgetter(i), parts))
+            divergence.append(float(terms["kl"]))
+            if max(divergence) <= (reuse.max_kl or np.inf):
+                by_loop = jax.tree.map(lambda x, g: x - 0.5 * g, by_loop, slope)
+    return found, by_loop, metrics, divergence
+
+
+@pytest.mark.parametrize("clip", [0.05, None])
+def test_several_steps_are_a_loop_over_epochs_and_parts(clip):
+    found, by_loop, metrics, divergence = steps_taken(Reuse(epochs=3, minibatches=2, clip=clip, value_clip=0.2))
+    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-4, atol=1e-5), found, by_loop)
+    assert metrics["gradient_steps"] == 6
+    np.testing.assert_allclose(metrics["kl"], np.mean(divergence), rtol=1e-3)
+
+
+def test_steps_end_where_the_policy_has_moved_too_far():
+    *_, divergence = steps_taken(Reuse(epochs=4, minibatches=2, clip=None))
+    assert 0 < divergence[1] < divergence[3] < divergence[-1]
+    limit = (divergence[3] + max(divergence[:3])) / 2
+    found, by_loop, metrics, _ = steps_taken(Reuse(epochs=4, minibatches=2, clip=None, max_kl=limit))
+    assert metrics["gradient_steps"] == 3
+    np.testing.assert_allclose(metrics["kl"], np.mean(divergence[:3]), rtol=1e-3)
+    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-4, atol=1e-5), found, by_loop)
+
+
+def test_finds_the_best_action_from_few_rollouts():
+    networks, algorithm = make(
+        Target(), td(0.9, 0.95, 4), num_envs=64, episode_length=2, learning_rate=1e-2, reuse=Reuse(10, 2, max_kl=0.1)
+    )
+    state, _ = jax.jit(lambda key: train_scan(algorithm, key, 40))(new_key())
+    act = deterministic_policy(networks, state.params, state.normalizer)
+    assert float(act(jnp.ones(1))[0]) == pytest.approx(0.5, abs=0.1)
 
 
 def test_evaluation_counts_each_episode_once_to_its_end():

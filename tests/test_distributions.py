@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 
 from jaxpg.distributions import (
     gaussian_entropy,
+    gaussian_kl,
     gaussian_log_prob,
     gaussian_sample,
     squash,
@@ -85,6 +86,33 @@ def test_score_is_the_slope_of_central_differences(limit):
             standardized = np.asarray((u - mean) / jnp.exp(log_std))[:, i]
             assert_close(in_mean, standardized / np.exp(log_std[:, i]), tolerance=1e-8)
             assert_close(in_log_std, standardized**2 - 1, tolerance=1e-8)
+
+
+def test_kl_divergence_is_the_integral():
+    """Of p log(p / q) for one action, by quadrature, and of the squashed densities, by the integral over the action."""
+    old_mean, old_log_std, mean, log_std = (jnp.array([x]) for x in (0.3, -0.5, -0.2, 0.1))
+    u = np.linspace(-12, 12, 200_001)
+    old, new = (
+        scipy.stats.norm.logpdf(u, m.item(), np.exp(s.item())) for m, s in ((old_mean, old_log_std), (mean, log_std))
+    )
+    expected = np.trapezoid(np.exp(old) * (old - new), u)
+    assert_close(gaussian_kl(old_mean, old_log_std, mean, log_std), expected)
+
+    a = jnp.linspace(-0.99999, 0.99999, 400_001)[:, None]
+    old, new = (
+        np.float64(squashed_gaussian_log_prob(jnp.arctanh(a), m, s))
+        for m, s in ((old_mean, old_log_std), (mean, log_std))
+    )
+    np.testing.assert_allclose(np.trapezoid(np.exp(old) * (old - new), a[:, 0]), expected, rtol=1e-3)
+
+
+def test_kl_divergence_is_zero_at_itself_and_adds_up_over_the_actions():
+    _, mean, log_std = policy()
+    assert_close(gaussian_kl(mean, log_std, mean, log_std), np.zeros(len(mean)))
+    each = [
+        gaussian_kl(mean[:, i : i + 1], log_std[:, i : i + 1], 0 * mean[:, :1], 0 * log_std[:, :1]) for i in range(3)
+    ]
+    assert_close(gaussian_kl(mean, log_std, 0 * mean, 0 * log_std), sum(each))
 
 
 @pytest.mark.parametrize("shape", [(1,), (3,), (5, 3)])

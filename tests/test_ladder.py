@@ -13,6 +13,7 @@ from jaxpg.types import Transition
 
 LADDER = [
     *(("td", f"algo.estimator={name}") for name in ESTIMATORS),
+    ("ppo", "algo.minibatches=2"),
     *(("reinforce", f"algo.baseline={name}") for name in BASELINES),
     ("reinforce", "algo.returns=whole"),
     ("reinforce", "algo.discounted=true"),
@@ -38,7 +39,10 @@ def test_estimators_learn_the_quadratic_problem(algo, option):
     Two chunks are one of twice the length, to the bit.
     """
     config = compose(["env=quadratic", f"algo={algo}", option])
-    algorithm, length = make_algorithm(config, make_env(config)), {"td": 30, "reinforce": 10, "online": 50}[algo]
+    algorithm, length = (
+        make_algorithm(config, make_env(config)),
+        {"td": 30, "ppo": 10, "reinforce": 10, "online": 50}[algo],
+    )
     keys = jnp.stack([jax.random.key(seed) for seed in (0, 1)])
 
     one, two = (

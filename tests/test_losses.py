@@ -6,7 +6,13 @@ import numpy as np
 import pytest
 
 from jaxpg.distributions import gaussian_log_prob
-from jaxpg.losses import entropy_loss, policy_gradient_loss, value_loss
+from jaxpg.losses import (
+    clipped_surrogate_loss,
+    clipped_value_loss,
+    entropy_loss,
+    policy_gradient_loss,
+    value_loss,
+)
 
 SHAPES = [(1,), (6,), (5, 3)]
 
@@ -53,6 +59,61 @@ def test_value_loss_is_half_the_mean_squared_error(shape):
     assert_close(value_loss(value, target), 0.5 * mean((v - y) ** 2 for v, y in entries(value, target)))
     expected = 0.5 * mean(w * (v - y) ** 2 for w, v, y in entries(weight, value, target))
     assert_close(value_loss(value, target, weight), expected)
+
+
+@pytest.mark.parametrize("clip", [0.1, 0.5, None])
+@pytest.mark.parametrize("shape", SHAPES)
+def test_clipped_surrogate_is_the_equation(shape, clip):
+    log_prob, old, advantage = random(shape, 3)
+    log_prob = old + 0.4 * log_prob  # ratios from about 0.5 to 2
+    weight = random_weight(shape)
+
+    def gain(p, q, a):
+        ratio = np.exp(p - q)
+        return ratio * a if clip is None else min(ratio * a, np.clip(ratio, 1 - clip, 1 + clip) * a)
+
+    expected = -mean(w * gain(p, q, a) for w, p, q, a in entries(weight, log_prob, old, advantage))
+    assert_close(clipped_surrogate_loss(log_prob, old, advantage, clip, weight), expected)
+
+
+@pytest.mark.parametrize("clip", [0.2, None])
+def test_clipped_surrogate_has_the_policy_gradient_at_the_policy_that_acted(clip):
+    log_prob, advantage = random((5, 3), 2)
+    weight = random_weight((5, 3))
+    found = jax.grad(clipped_surrogate_loss)(log_prob, log_prob, advantage, clip, weight)
+    np.testing.assert_array_equal(found, jax.grad(policy_gradient_loss)(log_prob, advantage, weight))
+
+
+@pytest.mark.parametrize(
+    ("ratio", "advantage", "moves"),
+    [(1.3, 1.0, False), (0.7, -1.0, False), (1.3, -1.0, True), (0.7, 1.0, True), (1.1, 1.0, True), (0.9, -1.0, True)],
+)
+def test_no_gradient_beyond_the_clip_in_the_advantages_direction(ratio, advantage, moves):
+    """Back towards 1, and within 1 +- 0.2, it is -rho A."""
+    slope = jax.grad(clipped_surrogate_loss)(jnp.log(jnp.array([ratio])), jnp.zeros(1), jnp.array([advantage]), 0.2)
+    assert_close(slope, [-ratio * advantage * moves])
+
+
+@pytest.mark.parametrize("shape", SHAPES)
+def test_clipped_value_loss_is_the_equation(shape):
+    value, old, target = random(shape, 3)
+    weight = random_weight(shape)
+
+    def error(v, q, y):
+        return max((v - y) ** 2, (q + np.clip(v - q, -0.5, 0.5) - y) ** 2)
+
+    expected = 0.5 * mean(w * error(v, q, y) for w, v, q, y in entries(weight, value, old, target))
+    assert_close(clipped_value_loss(value, old, target, 0.5, weight), expected)
+    assert_close(clipped_value_loss(value, old, target, 100.0, weight), value_loss(value, target, weight))
+
+
+def test_no_gradient_passes_through_what_was_before():
+    x, old, y = random((5, 3), 3)
+    for slope in (
+        *jax.grad(clipped_surrogate_loss, argnums=(1, 2))(x, old, y, 0.2),
+        *jax.grad(clipped_value_loss, argnums=(1, 2))(x, old, y, 0.2),
+    ):
+        np.testing.assert_array_equal(slope, np.zeros((5, 3)))
 
 
 @pytest.mark.parametrize("shape", SHAPES)

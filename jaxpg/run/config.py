@@ -82,6 +82,15 @@ def _complete(config: Config) -> Config:
             raise OptionError(["algo.baseline=leave_one_out needs other episodes: num_envs must be at least 2"])
         if config.algo.discounted and config.algo.returns == "whole":
             raise OptionError(["algo.discounted=true: whole returns have the factors gamma^t in them; leave it out"])
+    if config.choices["algo"] == "ppo" and config.run.num_envs % config.algo.minibatches:
+        divisors = [n for n in range(1, config.run.num_envs + 1) if config.run.num_envs % n == 0]
+        nearest = min(divisors, key=lambda n: abs(n - config.algo.minibatches))
+        raise OptionError(
+            [
+                f"algo.minibatches={config.algo.minibatches} does not divide num_envs={config.run.num_envs}: "
+                f"the nearest that does is {nearest}"
+            ]
+        )
     if config.choices["network"] == "linear" and config.network.features == "radial" and config.network.order < 2:
         raise OptionError([f"network.order={config.network.order}: radial features need at least 2 points of an axis"])
     if config.run.num_seeds + config.run.seed > 2**32:

@@ -13,7 +13,7 @@ import optax
 
 import envs
 from envs.options import OptionError
-from jaxpg.actor_critic import Method, actor_critic, deterministic_policy, reinforce, td
+from jaxpg.actor_critic import Method, Reuse, actor_critic, deterministic_policy, reinforce, td
 from jaxpg.distributions import GAUSSIAN, SQUASHED_GAUSSIAN
 from jaxpg.evaluation import Episodes, evaluate
 from jaxpg.features import num_features
@@ -131,6 +131,7 @@ def make_algorithm(config: Config, env: Any) -> Algorithm:
         networks,
         make_optimizer(config),
         make_method(config),
+        reuse=make_reuse(config),
         reward_scale=algo.reward_scale,
         entropy_coef=algo.entropy_coef,
         normalize_observations=algo.normalize_observations,
@@ -140,15 +141,22 @@ def make_algorithm(config: Config, env: Any) -> Algorithm:
 
 def make_method(config: Config) -> Method:
     algo = config.algo
-    if config.choices["algo"] == "td":
-        return td(algo.gamma, algo.lambda_, config.run.num_steps, algo.estimator, algo.n)
-    return reinforce(algo.gamma, algo.baseline, algo.returns, algo.discounted)
+    if config.choices["algo"] == "reinforce":
+        return reinforce(algo.gamma, algo.baseline, algo.returns, algo.discounted)
+    return td(algo.gamma, algo.lambda_, config.run.num_steps, algo.estimator, algo.n)
+
+
+def make_reuse(config: Config) -> Reuse | None:
+    """How often a rollout is learned from; None is once."""
+    if config.choices["algo"] != "ppo":
+        return None
+    return Reuse(**{name: getattr(config.algo, name) for name in Reuse._fields})
 
 
 def make_optimizer(config: Config) -> optax.GradientTransformation:
     """Adam for actor and critic apart, with shortened gradients and linearly falling step sizes."""
-    algo, run = config.algo, config.run
-    horizon = _ceil(run.total_steps, run.num_envs * run.num_steps)
+    algo, run, reuse = config.algo, config.run, make_reuse(config)
+    horizon = _ceil(run.total_steps, run.num_envs * run.num_steps) * (reuse.epochs * reuse.minibatches if reuse else 1)
 
     def adam(step_size):
         schedule = optax.linear_schedule(step_size, step_size * algo.final_lr, horizon)

@@ -46,6 +46,17 @@ class TD(Learning):
 
 
 @dataclass(frozen=True)
+class PPO(TD):
+    """Proximal policy optimization: TD with several gradient steps on the clipped surrogate for each rollout."""
+
+    epochs: int = option(10, "passes over a rollout", at_least=1)
+    minibatches: int = option(1, "gradient steps of a pass; divides num_envs", at_least=1)
+    clip: float | None = option(0.2, "the ratio of the probabilities is clipped at 1 +- this; null: not", above=0)
+    value_clip: float | None = option(None, "values are held within this of the rollout's; null: not", above=0)
+    max_kl: float | None = option(None, "steps end at this KL divergence from the rollout's policy; null: not", above=0)
+
+
+@dataclass(frozen=True)
 class Reinforce(Learning):
     """REINFORCE: complete episodes, Monte Carlo returns."""
 
@@ -110,7 +121,7 @@ class Run:
 
 GROUPS: dict[str, dict[str, type]] = {
     "env": {name: entry.config for name, entry in envs.REGISTRY.items()},
-    "algo": {"td": TD, "reinforce": Reinforce, "online": Online},
+    "algo": {"td": TD, "ppo": PPO, "reinforce": Reinforce, "online": Online},
     "network": {"mlp": MLP, "linear": Linear},
 }
 
