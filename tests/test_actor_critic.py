@@ -220,6 +220,23 @@ def a_batch(networks, params, num_envs=6, method=None):
     return batch_of(networks, method, 1.0, True)(params, statistics, steps)
 
 
+def test_advantages_are_of_the_values_of_both_normalized_observations():
+    """TD(0): A = 2 r + gamma V(s') - V(s), with the true next observation at the time limit."""
+    networks, _ = make(Counter(), td(0.9, 0.0, 5))
+    params, vector = networks.init(new_key()), vectorize(Counter(), 6, 3)
+    statistics = normalization.update(normalization.init(2), jnp.array([[1.0, 2.0], [4.0, -3.0]]))
+    method, policy_fn = td(0.9, 0.0, 5), sampling_policy(networks, params, statistics)
+    _, steps = method.collect(vector, policy_fn, vector.reset(new_key()), jax.random.key(1))
+    batch = batch_of(networks, method, 2.0, False)(params, statistics, steps)
+    value, next_value = (
+        networks.value(params["critic"], normalization.normalize(statistics, x)) for x in (steps.obs, steps.next_obs)
+    )
+    expected = 2 * steps.reward + 0.9 * (1 - steps.terminated) * next_value - value
+    np.testing.assert_allclose(batch.advantage, expected, rtol=1e-5, atol=1e-5)
+    np.testing.assert_allclose(batch.target, expected + value, rtol=1e-5, atol=1e-5)
+    assert steps.truncated.sum() > 0
+
+
 @pytest.mark.parametrize("minibatches", [1, 2, 3])
 def test_parts_hold_every_environment_once(minibatches):
     networks, _ = make(Counter(), td(0.9, 0.95, 5))

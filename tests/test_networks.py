@@ -11,7 +11,7 @@ from jaxpg.distributions import GAUSSIAN, SQUASHED_GAUSSIAN, gaussian_log_prob
 from jaxpg.features import FEATURES, fourier, num_features, polynomial, radial
 from jaxpg.networks import SIGMAS, linear_networks, mlp_networks
 
-X = np.random.default_rng(0).normal(size=(20, 2))
+X = 2 * np.random.default_rng(0).normal(size=(20, 2))  # some beyond 3, where Fourier features end
 
 
 def test_polynomial_is_every_monomial():

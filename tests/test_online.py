@@ -8,10 +8,12 @@ import numpy as np
 import pytest
 
 from envs.quadratic import LinearQuadratic, QuadraticConfig, chain
+from jaxpg import normalization
 from jaxpg.distributions import GAUSSIAN
 from jaxpg.networks import linear_mean, linear_networks, mlp_networks
-from jaxpg.online import online_actor_critic
+from jaxpg.online import Traces, online_actor_critic, trace_update
 from jaxpg.training import initial_state, train_scan
+from jaxpg.types import Transition
 from jaxpg.vector_env import vectorize
 
 OPTIONS = {
@@ -111,6 +113,22 @@ def test_updates_are_the_lessons(options):
     assert truncated.sum() > 2
     for mine, true in zip(after, transcription(before, log, **options), strict=True):
         np.testing.assert_allclose(mine, true, rtol=0, atol=1e-6 * np.abs(true).max())
+
+
+def test_update_of_several_environments_is_the_mean_of_theirs():
+    """From the same parameters, with traces of their own."""
+    networks = linear_networks(2, 2, initial_std=0.5, distribution=GAUSSIAN)
+    update = trace_update(networks, 0.9, 0.7, 0.4, 0.1, 0.2, 1.0, discounted=False)
+    random, params, statistics = np.random.default_rng(0), networks.init(jax.random.key(0)), normalization.init(2)
+    obs, u, next_obs = (jnp.asarray(random.normal(size=(3, 2)), jnp.float32) for _ in range(3))
+    reward, zero = jnp.asarray(random.normal(size=3), jnp.float32), jnp.zeros(3)
+    steps = Transition(obs, u, reward, zero, zero, next_obs, zero, zero)
+    traces = jax.tree.map(lambda x: jnp.asarray(random.normal(size=(3, *x.shape)), jnp.float32), params)
+    traces = Traces(traces["actor"], traces["critic"], jnp.ones(3))
+    together, *_ = update(params, traces, statistics, steps)
+    rows = [jax.tree.map(lambda x, i=i: x[i : i + 1], (traces, steps)) for i in range(3)]
+    alone = [update(params, own_traces, statistics, own)[0] for own_traces, own in rows]
+    jax.tree.map(lambda x, *xs: np.testing.assert_allclose(x, sum(xs) / 3, rtol=1e-4, atol=1e-6), together, *alone)
 
 
 WRONG = {
