@@ -185,9 +185,17 @@ def _networks(actor, critic, phi, observation_size: int, distribution: Distribut
         x = phi(jnp.zeros(observation_size))
         return {"actor": actor.init(key_actor, x), "critic": critic.init(key_critic, x)}
 
-    return Networks(
-        init,
-        lambda params, obs: actor.apply(params, phi(obs)),
-        lambda params, obs: critic.apply(params, phi(obs))[..., 0],
-        distribution,
-    )
+    def policy(params, obs):
+        mean, log_std = actor.apply(params, phi(_rows(obs)))
+        mean = mean.reshape(*obs.shape[:-1], -1)
+        return mean, log_std.reshape(mean.shape) if log_std.ndim > 1 else log_std
+
+    def value(params, obs):
+        return critic.apply(params, phi(_rows(obs))).reshape(obs.shape[:-1])
+
+    return Networks(init, policy, value, distribution)
+
+
+def _rows(obs: jax.Array) -> jax.Array:
+    """`[..., n]` as one matrix: XLA multiplies it, and above all its gradient, twice as fast as a stack of matrices."""
+    return obs.reshape(-1, obs.shape[-1])
