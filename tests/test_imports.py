@@ -109,3 +109,13 @@ def test_help_loads_nothing_heavy():
     loaded = loaded_by("from jaxpg.train import main; main(['--help'])")
     assert "hydra" in loaded
     assert not loaded & {"mujoco", "brax", "orbax", "matplotlib", "tensorboardX"}
+
+
+def test_nothing_is_imported_before_it_is_needed():
+    """Checkpoints, TensorBoard and pictures come while XLA compiles; the environment's physics when it is made."""
+    loaded = loaded_by("from jaxpg.run import session")
+    assert not loaded & {"mujoco", "brax", "orbax", "hydra", "matplotlib", "tensorboardX"}
+
+
+def test_what_is_imported_while_xla_compiles_is_there():
+    assert "matplotlib.figure" in loaded_by("from jaxpg.run import session; session._import_the_rest()")

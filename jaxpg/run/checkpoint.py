@@ -140,7 +140,7 @@ def _storage(leaf: Any) -> jax.ShapeDtypeStruct:
 
 
 def _from_storage(array: Any, leaf: Any) -> jax.Array:
-    array = jax.numpy.asarray(array)
+    array = jax.device_put(array)  # jax.numpy.asarray would compile a program for it
     return jax.random.wrap_key_data(array, impl=jax.random.key_impl(leaf)) if _is_key(leaf) else array
 
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import functools
+
 import jax
 import numpy as np
 
@@ -15,8 +17,13 @@ Results = tuple[np.ndarray, dict[str, np.ndarray]]  # returns [N], metrics of th
 
 def play_own(stored: StoredPolicy, num_episodes: int, seed: int) -> Results:
     """Episodes in the environment that the policy was trained on; the seed fixes the starts."""
-    play = jax.jit(lambda key: evaluate(stored.env, stored.act, key, num_episodes, stored.config.env.episode_length))
-    episodes = play(jax.random.key(seed))
+
+    @jax.jit
+    def play(policy, key):
+        act = functools.partial(stored.act, policy)
+        return evaluate(stored.env, act, key, num_episodes, stored.config.env.episode_length)
+
+    episodes = play(stored.policy, jax.random.key(seed))
     metrics = {name: np.asarray(values) for name, values in episodes.metrics.items()}
     return np.asarray(episodes.episode_return, np.float64), metrics
 
@@ -40,7 +47,7 @@ def play_gymnasium(stored: StoredPolicy, num_episodes: int, seed: int) -> Result
     returns = np.zeros(num_episodes)
     truncated = np.zeros(num_episodes, bool)
     while not truncated.all():  # Pendulum-v1 never terminates: all episodes end together at its time limit
-        obs, reward, _, truncated, _ = pendulums.step(limit * np.asarray(act(obs)))
+        obs, reward, _, truncated, _ = pendulums.step(limit * np.asarray(act(stored.policy, obs)))
         returns += reward
     pendulums.close()
     return returns, {}

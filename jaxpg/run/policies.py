@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple
 
 import jax
-import jax.numpy as jnp
+import numpy as np
 
 from jaxpg.actor_critic import deterministic_policy
 from jaxpg.run import config as configuration
@@ -22,14 +22,16 @@ class StoredPolicy(NamedTuple):
     """One agent of a run.
 
     Attributes:
-      act: `act(obs) -> action` in [-1, 1], deterministic.
+      act: `act(policy, obs) -> action` in [-1, 1], deterministic.
+      policy: its parameters; an argument of `act`, so that all policies of a kind are one compiled program.
       env: the environment, with the changes asked for.
       config: of the run, with the changes.
       seed: of the agent.
       update: updates made when the checkpoint was written.
     """
 
-    act: Any
+    act: Callable[[Policy, Any], Any]
+    policy: Policy
     env: Any
     config: Config
     seed: int
@@ -56,16 +58,20 @@ def load(
     shape = jax.eval_shape(initializer(config, make_algorithm(config, env)), agent_keys(config))
     best, update = _restore(Checkpoints(run_folder.best), shape.best, run)
     if agent is None:
-        agent = int(jnp.argmax(best.episode_return))
+        agent = int(np.argmax(best.episode_return))
     if not 0 <= agent < config.run.num_seeds:
         raise UserError(f"agent={agent}: the run has agents 0 to {config.run.num_seeds - 1}")
     policy: Policy = best.policy
     if which == "last":
         state, update = _restore(Checkpoints(run_folder.checkpoints), shape, run)
         policy = current_policy(state.train)
-    policy = jax.tree.map(lambda x: x[agent], policy)
-    act = deterministic_policy(make_networks(config, env), policy.params, policy.normalizer)
-    return StoredPolicy(act, env, config, config.run.seed + agent, update)
+    policy = jax.tree.map(lambda x: np.asarray(x)[agent], policy)
+    networks = make_networks(config, env)
+
+    def act(policy, obs):
+        return deterministic_policy(networks, policy.params, policy.normalizer)(obs)
+
+    return StoredPolicy(act, policy, env, config, config.run.seed + agent, update)
 
 
 def _restore(checkpoints: Checkpoints, template: Any, run: str) -> tuple[Any, int]:

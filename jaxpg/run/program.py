@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any, NamedTuple
@@ -59,13 +60,13 @@ class Program(NamedTuple):
     """The compiled functions of a run; every state and result has the agents as its leading axis `[S, ...]`.
 
     Attributes:
-      init: `init() -> RunState`.
+      init: `init() -> RunState`; None in the program of a run that is resumed.
       advance: `advance(TrainState) -> (TrainState, metrics)`, one chunk; metrics are `[S, chunk]`.
       evaluate: `evaluate(Policy) -> Episodes` `[S, eval_episodes]`.
       state_shape: shapes and types of the run's state.
     """
 
-    init: Callable[[], RunState]
+    init: Callable[[], RunState] | None
     advance: Callable[[TrainState], tuple[TrainState, Metrics]]
     evaluate: Callable[[Policy], Episodes]
     state_shape: RunState
@@ -167,8 +168,17 @@ def make_optimizer(config: Config) -> optax.GradientTransformation:
     )
 
 
-def compile_program(config: Config, env: Any, chunk: int) -> Program:
-    """Traces and compiles `chunk` updates and the evaluation, in `env`."""
+def compile_program(
+    config: Config, env: Any, chunk: int, resumed: bool = False, meanwhile: Callable[[], None] = lambda: None
+) -> Program:
+    """Traces and compiles `chunk` updates, the evaluation and the beginning of a run.
+
+    Args:
+      config, env: of the run.
+      chunk: updates of one call.
+      resumed: the state comes from a checkpoint; `init` is not compiled.
+      meanwhile: called once while XLA compiles in other threads.
+    """
     run = config.run
     networks, algorithm = make_networks(config, env), make_algorithm(config, env)
     keys = agent_keys(config)
@@ -182,13 +192,18 @@ def compile_program(config: Config, env: Any, chunk: int) -> Program:
 
     init = initializer(config, algorithm)
     shape = jax.eval_shape(init, keys)
+    advance, play = over_agents(advance, run.num_seeds), over_agents(play, run.num_seeds)
     with ThreadPoolExecutor() as pool:
-        advance, play, init = pool.map(
-            _compile,
-            (over_agents(advance, run.num_seeds), over_agents(play, run.num_seeds), init),
-            ((keys, shape.train), (current_policy(shape.train),), (keys,)),
-        )
-    return Program(lambda: init(keys), lambda train: advance(keys, train), play, shape)
+        # Tracing holds Python's lock and compiling does not: one trace after the other, that of the longest compilation
+        # first, so that no compilation waits for another one's trace.
+        advance = pool.submit(jax.jit(advance).lower(keys, shape.train).compile)
+        init = None if resumed else pool.submit(jax.jit(init).lower(keys).compile)
+        play = pool.submit(jax.jit(play).lower(current_policy(shape.train)).compile)
+        meanwhile()
+    advance, play = advance.result(), play.result()
+    return Program(
+        functools.partial(init.result(), keys) if init else None, functools.partial(advance, keys), play, shape
+    )
 
 
 def agent_keys(config: Config) -> jax.Array:
@@ -198,12 +213,12 @@ def agent_keys(config: Config) -> jax.Array:
 
 def initializer(config: Config, algorithm: Algorithm) -> Callable[[jax.Array], RunState]:
     """`init(keys[S]) -> RunState`, the run before its first update."""
-    init = over_agents(lambda key: initial_state(algorithm, key), config.run.num_seeds)
-    return lambda keys: start(init(keys))
+    begin = over_agents(lambda key: initial_state(algorithm, key), config.run.num_seeds)
 
+    def init(keys):
+        return start(begin(keys))
 
-def _compile(fn: Callable, arguments: tuple) -> Callable:
-    return jax.jit(fn).lower(*arguments).compile()
+    return init
 
 
 def over_agents(fn: Callable, num_seeds: int) -> Callable:
@@ -211,6 +226,7 @@ def over_agents(fn: Callable, num_seeds: int) -> Callable:
     if num_seeds > 1:
         return jax.vmap(fn)
 
+    @functools.wraps(fn)
     def one(*arguments):
         result = fn(*jax.tree.map(lambda x: x[0], arguments))
         return jax.tree.map(lambda x: x[None], result)

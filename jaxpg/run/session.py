@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 import time
 from collections.abc import Mapping
 from typing import Any, NamedTuple
@@ -10,7 +11,6 @@ import numpy as np
 
 from jaxpg.run import config as configuration
 from jaxpg.run import figures, folder
-from jaxpg.run.checkpoint import Checkpoints
 from jaxpg.run.config import Config
 from jaxpg.run.errors import UserError
 from jaxpg.run.folder import MetricsLog, RunFolder, jsonable
@@ -18,8 +18,10 @@ from jaxpg.run.program import Program, Schedule, compile_program, make_env, plan
 from jaxpg.run.runtime import StopRequests, prepare
 from jaxpg.run.state import Best, RunState, better, current_policy
 from jaxpg.run.terminal import Display, shown
-from jaxpg.types import Metrics
+from jaxpg.types import Metrics, TrainState
 
+# Slow to import and not needed before training: imported while XLA compiles.
+NEEDED_LATER = ("jaxpg.run.checkpoint", "tensorboardX", "matplotlib.figure", "matplotlib.backends.backend_agg")
 # What may change together with resume=DIR; anything else would be another run.
 RESUMABLE = ("total_steps", "log_interval", "eval_interval", "checkpoint_interval")
 
@@ -53,6 +55,8 @@ def begin(config: Config) -> int:
 
 def resume(given: Mapping[str, Any]) -> int:
     """Goes on from the newest checkpoint of the run in `given["resume"]`; returns the exit status."""
+    from jaxpg.run.checkpoint import Checkpoints
+
     changes = {name: value for name, value in given.items() if name != "resume"}
     run_folder = folder.find(str(given["resume"]))
     config = _changed(run_folder, changes)
@@ -75,7 +79,7 @@ def resume(given: Mapping[str, Any]) -> int:
         if recorded.get(name) != now:
             display.say(f"note: {name} was {recorded.get(name)} and is {now}: the same run, but not the same bits")
     session = Session(config, schedule, run_folder, display)
-    program, seconds = _compile(session, make_env(config))
+    program, seconds = _compile(session, make_env(config), resumed=True)
     state = checkpoints.restore(update, program.state_shape)
     configuration.save(config, run_folder.config)
     return _train(session, program, state, seconds)
@@ -95,21 +99,26 @@ def _changed(run_folder: RunFolder, changes: Mapping[str, Any]) -> Config:
     return changed
 
 
-def _compile(session: Session, env: Any) -> tuple[Program, float]:
+def _compile(session: Session, env: Any, resumed: bool = False) -> tuple[Program, float]:
     """The compiled program, and the seconds that it took."""
     session.display.say("compiling ...")
     began = time.monotonic()
-    program = compile_program(session.config, env, session.schedule.chunk)
+    program = compile_program(session.config, env, session.schedule.chunk, resumed, meanwhile=_import_the_rest)
     seconds = time.monotonic() - began
     session.display.say(f"compiled in {seconds:.1f} s")
     return program, seconds
+
+
+def _import_the_rest() -> None:
+    for name in NEEDED_LATER:
+        importlib.import_module(name)
 
 
 def _train(session: Session, program: Program, state: RunState, compile_seconds: float) -> int:
     """Chunk after chunk until the last update or a request to stop; returns the exit status."""
     config, schedule, run_folder, display = session
     keeper = _Keeper(run_folder, config)
-    first = update = int(state.train.update[0])
+    first = update = _update(state.train)
     log = MetricsLog(run_folder, update)
     began, seconds_before = time.monotonic(), log.seconds
     display.start()
@@ -117,7 +126,7 @@ def _train(session: Session, program: Program, state: RunState, compile_seconds:
         with StopRequests() as stop:
             while update < schedule.num_updates and not stop.signal:
                 train, metrics = program.advance(state.train)
-                update = int(train.update[0])
+                update = _update(train)
                 line = {"update": update, "steps": update * schedule.steps_per_update} | _summary(metrics)
                 state = state._replace(train=train)
                 if schedule.is_due(update, schedule.eval_every):
@@ -141,6 +150,11 @@ def _train(session: Session, program: Program, state: RunState, compile_seconds:
     return 0
 
 
+def _update(train: TrainState) -> int:
+    """The updates made; read by numpy, as jax would compile a program that picks the number."""
+    return int(np.asarray(train.update)[0])
+
+
 def _draw(config: Config, run_folder: RunFolder) -> list[dict[str, Any]]:
     """Draws the learning curve; returns the lines of metrics that it shows."""
     lines = folder.read_metrics(run_folder)
@@ -153,6 +167,8 @@ class _Keeper:
     """Writes the run's state to `checkpoints/` and its best policy to `best/`."""
 
     def __init__(self, run_folder: RunFolder, config: Config):
+        from jaxpg.run.checkpoint import Checkpoints
+
         self._checkpoints = Checkpoints(run_folder.checkpoints)
         self._best = Checkpoints(run_folder.best, keep=1)
         self._meta = {"config": config.to_dict()}
@@ -175,9 +191,9 @@ def _evaluate(program: Program, state: RunState) -> tuple[RunState, dict[str, An
     """The deterministic policy's results, and the state with the best policy kept."""
     policy = current_policy(state.train)
     episodes = program.evaluate(policy)
-    mean_return = episodes.episode_return.mean(axis=-1)
-    results = {"return": mean_return} | {name: value.mean(axis=-1) for name, value in episodes.metrics.items()}
-    best = better(state.best, Best(policy, mean_return))
+    values = {"return": episodes.episode_return} | episodes.metrics
+    results = {name: np.asarray(value, np.float64).mean(axis=-1) for name, value in values.items()}
+    best = better(state.best, Best(policy, results["return"].astype(np.float32)))
     return state._replace(best=best), {f"eval_{name}": jsonable(value) for name, value in results.items()}
 
 

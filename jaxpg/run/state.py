@@ -6,6 +6,7 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from jaxpg.normalization import RunningStatistics
 from jaxpg.types import PyTree, TrainState
@@ -52,10 +53,14 @@ def current_policy(train: TrainState) -> Policy:
 
 
 def better(old: Best, new: Best) -> Best:
-    """Agent by agent the policy with the higher return; of equals the old one, and a NaN is not higher."""
-    improved = new.episode_return > old.episode_return
+    """Agent by agent the policy with the higher return; of equals the old one, and a NaN is not higher.
 
-    def choose(a: jax.Array, b: jax.Array) -> jax.Array:
-        return jnp.where(improved.reshape(improved.shape + (1,) * (a.ndim - 1)), a, b)
+    Computed by numpy: jax would compile a program for every shape, at the first evaluation of each run.
+    """
+    improved = np.asarray(new.episode_return) > np.asarray(old.episode_return)
+
+    def choose(a: jax.Array, b: jax.Array) -> np.ndarray:
+        a, b = np.asarray(a), np.asarray(b)
+        return np.where(improved.reshape(improved.shape + (1,) * (a.ndim - 1)), a, b)
 
     return jax.tree.map(choose, new, old)
