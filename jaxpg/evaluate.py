@@ -18,6 +18,7 @@ def main(arguments: Sequence[str]) -> int:
         print(help.evaluate_help())
         return 0
     from jaxpg.run import episodes, policies
+    from jaxpg.run.cache import compilation_cache
 
     given = config.parse(arguments)
     changes = {name: value for name, value in given.items() if name.startswith("env.")}
@@ -26,7 +27,8 @@ def main(arguments: Sequence[str]) -> int:
         raise UserError("run=DIR is missing: the folder of the run to evaluate")
     stored = policies.load(options.run, options.checkpoint, options.agent, changes)
     play = episodes.play_gymnasium if options.backend == "gymnasium" else episodes.play_own
-    returns, metrics = play(stored, options.episodes, options.seed)
+    with compilation_cache(options.cache, print):
+        returns, metrics = play(stored, options.episodes, options.seed)
     mean, stderr = returns.mean(), returns.std(ddof=1) / math.sqrt(len(returns))
     saved = f"{options.checkpoint} policy (saved after {stored.update:,} updates)"
     print(f"{stored.config.choices['env']}, seed {stored.seed}, {saved}, {options.backend}")

@@ -117,6 +117,7 @@ class Run:
     eval_episodes: int = option(512, "episodes of an evaluation", at_least=1)
     checkpoint_interval: int = option(1_000_000, "environment steps between two checkpoints", at_least=1)
     run_dir: str | None = option(None, "run folder [default: runs/<env>-<algo>-s<seed>-<time>]")
+    cache: bool = option(True, "keep compiled programs in the user's cache folder, for the next run")
 
 
 GROUPS: dict[str, dict[str, type]] = {
@@ -138,4 +139,5 @@ class EvaluateOptions:
         "best", "the best policy by the evaluations while training, or the last", choices=("best", "last")
     )
     agent: int | None = option(None, "which of several agents, from 0 [default: the best]", at_least=0)
+    cache: bool = option(True, "keep the compiled program in the user's cache folder, for the next evaluation")
     json: bool = option(False, "end with one line of JSON: mean, stderr, episodes, success")

@@ -11,6 +11,7 @@ import numpy as np
 
 from jaxpg.run import config as configuration
 from jaxpg.run import figures, folder
+from jaxpg.run.cache import compilation_cache
 from jaxpg.run.config import Config
 from jaxpg.run.errors import UserError
 from jaxpg.run.folder import MetricsLog, RunFolder, jsonable
@@ -23,7 +24,7 @@ from jaxpg.types import Metrics, TrainState
 # Slow to import and not needed before training: imported while XLA compiles.
 NEEDED_LATER = ("jaxpg.run.checkpoint", "tensorboardX", "matplotlib.figure", "matplotlib.backends.backend_agg")
 # What may change together with resume=DIR; anything else would be another run.
-RESUMABLE = ("total_steps", "log_interval", "eval_interval", "checkpoint_interval")
+RESUMABLE = ("total_steps", "log_interval", "eval_interval", "checkpoint_interval", "cache")
 
 
 class Session(NamedTuple):
@@ -103,7 +104,8 @@ def _compile(session: Session, env: Any, resumed: bool = False) -> tuple[Program
     """The compiled program, and the seconds that it took."""
     session.display.say("compiling ...")
     began = time.monotonic()
-    program = compile_program(session.config, env, session.schedule.chunk, resumed, meanwhile=_import_the_rest)
+    with compilation_cache(session.config.run.cache, session.display.say):
+        program = compile_program(session.config, env, session.schedule.chunk, resumed, meanwhile=_import_the_rest)
     seconds = time.monotonic() - began
     session.display.say(f"compiled in {seconds:.1f} s")
     return program, seconds

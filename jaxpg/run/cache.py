@@ -1,0 +1,260 @@
+"""Compiled programs kept between runs, so that only the first run of a kind waits for XLA.
+
+What jax's persistent compilation cache holds is machine code that will be executed, and jax trusts its folder: it
+neither checks an entry nor ever replaces one that it cannot read. So jax gets a fresh temporary folder while a command
+compiles. Entries are copied into it from the store, where each has its digest in its name, once the digest has been
+verified; what jax adds is published in the store by renaming, which other processes see whole or not at all.
+
+The store is `jaxpg` in the user's cache folder (XDG_CACHE_HOME, else ~/.cache), with one folder for each jaxlib, CPU,
+XLA_FLAGS and number of threads: jax's own keys leave out the last one, and trust the CPU to be the same.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import os
+import platform
+import shutil
+import stat
+import tempfile
+import threading
+import time
+import warnings
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import jax
+import jaxlib
+from jax.experimental.compilation_cache import compilation_cache as jax_cache
+
+from jaxpg.run.folder import num_threads
+
+MAX_AGE = 30 * 24 * 3600.0  # seconds; an older entry is removed, and compiled anew when it is needed
+MAX_BYTES = 64 * 2**20  # of all entries together: every start reads those of its folder. A training takes half a MB.
+MAX_STAGING_AGE = 24 * 3600.0  # of the temporary folder of a process that was killed
+STAGING = "staging-"
+REJECTED = "rejected"  # a file where the entries belong, on a machine that cannot load what it has compiled
+UNREADABLE = "Error reading persistent compilation cache entry"
+# XLA's words, on standard error, for a program that it takes for another machine's; some CPUs never know their own.
+OTHER_MACHINE = b"Machine type used for XLA:CPU compilation"
+
+
+class CacheError(Exception):
+    """A folder that compiled programs cannot be kept in; its text says why."""
+
+
+@contextlib.contextmanager
+def compilation_cache(enabled: bool, say: Callable[[str], None]) -> Iterator[None]:
+    """What jax compiles inside comes from the store where it is there, and is kept in it where it is not.
+
+    Nothing is changed where the user has set jax's own cache folder. Whatever is wrong with the store is one line, and
+    then there is no cache or a smaller one; it never stops a command.
+
+    Args:
+      enabled: without it nothing is read or written.
+      say: takes the line, if there is something to say.
+    """
+    if not enabled or jax.config.jax_compilation_cache_dir is not None:
+        yield
+        return
+    try:
+        store = Store(cache_folder())
+        staging = store.stage()
+    except (CacheError, OSError) as error:
+        say(f"note: no compilation cache: {error}")
+        yield
+        return
+    with staging:
+        yield from _compile_in(store, Path(staging.name), say)
+
+
+def _compile_in(store: Store, staging: Path, say: Callable[[str], None]) -> Iterator[None]:
+    with warnings.catch_warnings(record=True) as caught, _without_other_machine(bool(store.loaded)) as refusals:
+        warnings.simplefilter("always")
+        with _jax_cache_in(staging):
+            yield
+    rejected = bool(refusals)
+    for warning in caught:
+        if str(warning.message).startswith(UNREADABLE):
+            rejected = True
+        else:
+            warnings.warn_explicit(warning.message, warning.category, warning.filename, warning.lineno)
+    try:
+        store.reject() if rejected else store.publish(staging)
+    except OSError as error:
+        say(f"note: compiled programs could not be kept: {error}")
+    for line in store.notes:
+        say(f"note: {line}")
+
+
+@contextlib.contextmanager
+def _jax_cache_in(folder: Path) -> Iterator[None]:
+    """jax's persistent cache in this folder, for every program however small; afterwards as it was before."""
+    settings = {
+        "jax_compilation_cache_dir": str(folder),
+        "jax_persistent_cache_min_compile_time_secs": 0.0,
+        "jax_persistent_cache_enable_xla_caches": "none",
+    }
+    before = {name: getattr(jax.config, name) for name in settings}
+    try:
+        _configure(settings)
+        yield
+    finally:
+        _configure(before)
+
+
+def _configure(settings: dict) -> None:
+    for name, value in settings.items():
+        jax.config.update(name, value)
+    jax_cache.reset_cache()  # jax looks at its settings once, at the first compilation
+
+
+class Store:
+    """The entries that belong to this jaxlib, CPU, XLA_FLAGS and number of threads.
+
+    Attributes:
+      folder: where they are.
+      loaded: names of the entries that `stage` found intact.
+      notes: what was wrong, one line each.
+
+    Raises:
+      CacheError: the folder is not the user's alone.
+    """
+
+    def __init__(self, root: Path):
+        self.root, self.folder = root, root / machine()
+        self.loaded: set[str] = set()
+        self.notes: list[str] = []
+        root.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
+        for folder in (root, self.folder):
+            folder.mkdir(mode=0o700, exist_ok=True)
+            check_private(folder)
+
+    def stage(self) -> tempfile.TemporaryDirectory:
+        """A temporary folder with every entry that is intact; those that are not are removed."""
+        remove_old(self.root)
+        if (self.folder / REJECTED).exists():
+            raise CacheError("XLA cannot load on this machine what it has compiled here")
+        staging = tempfile.TemporaryDirectory(prefix=STAGING, dir=self.root)
+        try:
+            self._load_into(Path(staging.name))
+        except OSError:
+            staging.cleanup()
+            raise
+        return staging
+
+    def _load_into(self, staging: Path) -> None:
+        damaged = 0
+        for path in _entries(self.folder):
+            name, _, digest = path.name.rpartition(".")
+            content = path.read_bytes()
+            if _digest(content) == digest:
+                (staging / name).write_bytes(content)
+                self.loaded.add(name)
+            else:
+                path.unlink(missing_ok=True)
+                damaged += 1
+        if damaged:
+            self.notes.append(f"{damaged} damaged of the compiled programs in {self.folder}: removed")
+
+    def publish(self, staging: Path) -> None:
+        """Moves the entries that jax has added since `stage` into the store."""
+        for path in staging.iterdir():
+            if path.is_file() and path.name not in self.loaded:
+                path.replace(self.folder / f"{path.name}.{_digest(path.read_bytes())}")
+
+    def reject(self) -> None:
+        """Removes the entries, which XLA would not load, and keeps no others."""
+        for path in _entries(self.folder):
+            path.unlink(missing_ok=True)
+        (self.folder / REJECTED).touch()
+        self.notes.append("XLA did not load its own compiled programs: they are no longer kept on this machine")
+
+
+def cache_folder() -> Path:
+    """`jaxpg` in the user's cache folder; raises CacheError where the user has none."""
+    given = os.environ.get("XDG_CACHE_HOME", "")
+    try:
+        return (Path(given) if os.path.isabs(given) else Path.home() / ".cache") / "jaxpg"
+    except RuntimeError as error:
+        raise CacheError("the user has no home folder") from error
+
+
+def machine() -> str:
+    """The name of the folder for what was compiled here."""
+    flags = os.environ.get("XLA_FLAGS", "").encode()
+    return f"jaxlib-{jaxlib.__version__}-cpu-{_digest(cpu_features())}-flags-{_digest(flags)}-threads-{num_threads()}"
+
+
+def cpu_features() -> bytes:
+    """What the CPU can do, as far as the system says: the flags of the first core, or else its name."""
+    with contextlib.suppress(OSError):
+        for line in Path("/proc/cpuinfo").read_bytes().splitlines():
+            if line.startswith((b"flags", b"Features")):
+                return line
+    return f"{platform.machine()} {platform.processor()}".encode()
+
+
+def check_private(folder: Path) -> None:
+    """Raises CacheError unless `folder` is a real folder that belongs to this user and that no other can write to."""
+    found = folder.lstat()
+    if stat.S_ISLNK(found.st_mode) or not stat.S_ISDIR(found.st_mode):
+        raise CacheError(f"{folder} is not a folder of its own")
+    if found.st_uid != os.getuid():
+        raise CacheError(f"{folder} belongs to another user")
+    if found.st_mode & (stat.S_IWGRP | stat.S_IWOTH):
+        raise CacheError(f"{folder} can be written to by others")
+
+
+def remove_old(root: Path, now: float | None = None) -> None:
+    """Keeps the newest entries of all machines, up to `MAX_AGE` and `MAX_BYTES`; removes left temporary folders."""
+    now, total = now or time.time(), 0
+    files = [(path, path.lstat()) for path in root.glob("jaxlib-*/*")]
+    for path, found in sorted(files, key=lambda file: file[1].st_mtime, reverse=True):
+        total += found.st_size
+        if total > MAX_BYTES or now - found.st_mtime > MAX_AGE:
+            path.unlink(missing_ok=True)
+    for path in root.glob(f"{STAGING}*"):
+        if now - path.lstat().st_mtime > MAX_STAGING_AGE:
+            shutil.rmtree(path, ignore_errors=True)
+
+
+def _entries(folder: Path) -> list[Path]:
+    return [path for path in folder.iterdir() if path.name != REJECTED]
+
+
+def _digest(content: bytes) -> str:
+    return hashlib.blake2b(content, digest_size=16).hexdigest()
+
+
+@contextlib.contextmanager
+def _without_other_machine(needed: bool) -> Iterator[list[bytes]]:
+    """Standard error without XLA's lines about another machine, which are collected; only where `needed`.
+
+    They are written by C++, so the file descriptor itself is led through a pipe.
+    """
+    refusals: list[bytes] = []
+    if not needed:
+        yield refusals
+        return
+    before, (reader, writer) = os.dup(2), os.pipe()
+    os.dup2(writer, 2)
+    os.close(writer)
+    thread = threading.Thread(target=_filter, args=(reader, before, refusals))
+    thread.start()
+    try:
+        yield refusals
+    finally:
+        os.dup2(before, 2)  # closes the pipe's last writing end: the thread ends
+        thread.join()
+        os.close(before)
+
+
+def _filter(reader: int, writer: int, refusals: list[bytes]) -> None:
+    with os.fdopen(reader, "rb") as lines:
+        for line in lines:
+            if OTHER_MACHINE in line:
+                refusals.append(line)
+            else:
+                os.write(writer, line)
