@@ -7,6 +7,7 @@ import subprocess
 import sys
 import time
 
+import numpy as np
 import pytest
 
 from jaxpg.run.checkpoint import Checkpoints
@@ -102,6 +103,25 @@ def test_resume_with_more_steps(command, tmp_path):
     result = command("train", f"resume={folder}", "total_steps=512")
     assert result.returncode == 0, result.stderr
     assert [line["steps"] for line in metrics(folder)] == list(range(64, 513, 64))
+
+
+@pytest.mark.parametrize(("agents", "enough"), [("one", np.max), ("all", np.min)])
+def test_a_run_ends_where_the_return_is_reached(command, tmp_path, agents, enough):
+    """By the best or the worst of two agents; the checkpoint is there, and a higher return goes on."""
+    folder = tmp_path / "run"
+    sizes = ("num_seeds=2", "log_interval=1600", "eval_interval=1600", "eval_episodes=2")
+    quadratic = ("env=quadratic", "algo=reinforce", *sizes, f"stop_agents={agents}", "stop_return=-2")
+    result = command("train", *quadratic, f"run_dir={folder}")
+    assert result.returncode == 0, result.stderr
+    best = np.maximum.accumulate([line["eval_return"] for line in metrics(folder)])
+    *before, last = enough(best, axis=1)
+    assert last >= -2 > max(before)
+    assert f"reached stop_return=-2 after {metrics(folder)[-1]['steps']:,} steps" in result.stdout
+    assert digests(folder)[0] == metrics(folder)[-1]["update"]
+    assert "has reached stop_return=-2" in command("train", f"resume={folder}").stdout
+    result = command("train", f"resume={folder}", f"stop_return={last + 0.01}")
+    assert "reached stop_return=" in result.stdout
+    assert metrics(folder)[-1]["steps"] > metrics(folder)[len(before)]["steps"]
 
 
 def test_evaluation_of_a_run(uninterrupted, command):

@@ -115,6 +115,8 @@ class Run:
     log_interval: int = option(50_000, "environment steps between two lines of metrics", at_least=1)
     eval_interval: int = option(250_000, "environment steps between two evaluations", at_least=1)
     eval_episodes: int = option(512, "episodes of an evaluation", at_least=1)
+    stop_return: float | None = option(None, "the run ends early at an evaluation with this return; null: not")
+    stop_agents: str = option("all", "of several agents, which must have reached it", choices=("all", "one"))
     checkpoint_interval: int = option(1_000_000, "environment steps between two checkpoints", at_least=1)
     run_dir: str | None = option(None, "run folder [default: runs/<env>-<algo>-s<seed>-<time>]")
     cache: bool = option(True, "keep compiled programs in the user's cache folder, for the next run")

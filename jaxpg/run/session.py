@@ -17,6 +17,7 @@ from jaxpg.run.errors import UserError
 from jaxpg.run.folder import MetricsLog, RunFolder, jsonable
 from jaxpg.run.program import Program, Schedule, compile_program, make_env, plan
 from jaxpg.run.runtime import StopRequests, prepare
+from jaxpg.run.schema import Run
 from jaxpg.run.state import Best, RunState, better, current_policy
 from jaxpg.run.terminal import Display, shown
 from jaxpg.types import Metrics, TrainState
@@ -24,7 +25,10 @@ from jaxpg.types import Metrics, TrainState
 # Slow to import and not needed before training: imported while XLA compiles.
 NEEDED_LATER = ("jaxpg.run.checkpoint", "tensorboardX", "matplotlib.figure", "matplotlib.backends.backend_agg")
 # What may change together with resume=DIR; anything else would be another run.
-RESUMABLE = ("total_steps", "log_interval", "eval_interval", "checkpoint_interval", "cache")
+RESUMABLE = (
+    *("total_steps", "log_interval", "eval_interval", "checkpoint_interval"),
+    *("stop_return", "stop_agents", "cache"),
+)
 
 
 class Session(NamedTuple):
@@ -73,6 +77,9 @@ def resume(given: Mapping[str, Any]) -> int:
         _draw(config, run_folder)
         display.say(f"{run_folder.path} is finished; a larger total_steps goes on")
         return 0
+    if _solved(config.run, _best_returns(folder.read_metrics(run_folder))):
+        display.say(f"{run_folder.path} has reached stop_return={config.run.stop_return:g}; a higher one goes on")
+        return 0
     display.say(
         f"resuming {run_folder.path} at {update * schedule.steps_per_update:,} of {schedule.total_steps:,} steps"
     )
@@ -119,14 +126,14 @@ def _import_the_rest() -> None:
 def _train(session: Session, program: Program, state: RunState, compile_seconds: float) -> int:
     """Chunk after chunk until the last update or a request to stop; returns the exit status."""
     config, schedule, run_folder, display = session
-    keeper = _Keeper(run_folder, config)
+    keeper, solved = _Keeper(run_folder, config), False
     first = update = _update(state.train)
     log = MetricsLog(run_folder, update)
     began, seconds_before = time.monotonic(), log.seconds
     display.start()
     try:
         with StopRequests() as stop:
-            while update < schedule.num_updates and not stop.signal:
+            while update < schedule.num_updates and not solved and not stop.signal:
                 train, metrics = program.advance(state.train)
                 update = _update(train)
                 line = {"update": update, "steps": update * schedule.steps_per_update} | _summary(metrics)
@@ -134,15 +141,18 @@ def _train(session: Session, program: Program, state: RunState, compile_seconds:
                 if schedule.is_due(update, schedule.eval_every):
                     state, evaluation = _evaluate(program, state)
                     line |= evaluation
+                    solved = _solved(config.run, state.best.episode_return)
                 line["seconds"] = round(seconds_before + time.monotonic() - began, 3)
                 log.write(line)
                 display.update(line)
-                if schedule.is_due(update, schedule.checkpoint_every) or stop.signal:
+                if schedule.is_due(update, schedule.checkpoint_every) or solved or stop.signal:
                     keeper.save(update, state)
     finally:
         display.stop()
         log.close()
-    if update < schedule.num_updates:
+    if solved:
+        display.say(f"reached stop_return={config.run.stop_return:g} after {line['steps']:,} steps")
+    elif update < schedule.num_updates:
         display.say(f"{stop.signal.name}: stopped at {line['steps']:,} steps; resume={run_folder.path} goes on")
         return 128 + stop.signal
     training_seconds = time.monotonic() - began
@@ -199,12 +209,26 @@ def _evaluate(program: Program, state: RunState) -> tuple[RunState, dict[str, An
     return state._replace(best=best), {f"eval_{name}": jsonable(value) for name, value in results.items()}
 
 
+def _solved(run: Run, best_returns: np.ndarray) -> bool:
+    """Whether all agents, or one of them, have reached the return at which the run ends."""
+    if run.stop_return is None:
+        return False
+    reached = np.asarray(best_returns) >= run.stop_return
+    return bool(reached.all() if run.stop_agents == "all" else reached.any())
+
+
+def _best_returns(lines: list[dict[str, Any]]) -> np.ndarray:
+    """The best evaluation of each agent, `[S]`."""
+    evaluations = [line for line in lines if "eval_return" in line]
+    return figures.series(evaluations, "eval_return")[1].max(axis=1, initial=-np.inf)
+
+
 def _closing_rows(
     lines: list[dict[str, Any]], run_folder: RunFolder, rate: float, compile_seconds: float, training_seconds: float
 ) -> dict[str, str]:
     evaluations = [line for line in lines if "eval_return" in line]
     last = evaluations[-1]
-    best = figures.series(evaluations, "eval_return")[1].max(axis=1, initial=-np.inf).tolist()
+    best = _best_returns(lines).tolist()
     rows = {"deterministic return": f"{shown(last['eval_return'])} at the end, {shown(best)} at best"}
     if "eval_success" in last:
         success = np.mean(last["eval_success"])
