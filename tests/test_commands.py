@@ -154,13 +154,10 @@ def test_gymnasium_plays_the_same_episodes(command, tmp_path):
     assert abs(answers[0]["mean"] - answers[1]["mean"]) < 4 * spread
 
 
-@pytest.mark.parametrize("algo", ["td", "reinforce"])
-def test_several_seeds_of_the_arm(command, tmp_path, algo):
+def test_several_seeds_of_the_arm(command, tmp_path):
     folder = tmp_path / "run"
-    arguments = [argument for argument in TINY if algo == "td" or not argument.startswith("num_steps")]
     result = command(
-        *("train", "env=arm", f"algo={algo}", "num_seeds=3", *arguments, "env.episode_length=8", "total_steps=256"),
-        f"run_dir={folder}",
+        *("train", "env=arm", "num_seeds=3", *TINY, "env.episode_length=8", "total_steps=256"), f"run_dir={folder}"
     )
     assert result.returncode == 0, result.stderr
     assert "success" in result.stdout

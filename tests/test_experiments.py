@@ -52,11 +52,11 @@ def test_reinforce_and_td(experiments, monkeypatch):
     import reinforce_and_td
 
     monkeypatch.setattr(reinforce_and_td, "NUM_SEEDS", 2)
-    monkeypatch.setattr(reinforce_and_td, "TASKS", {"pendulum": reinforce_and_td.TASKS["pendulum"]})
+    monkeypatch.setattr(reinforce_and_td, "TASKS", {"quadratic": reinforce_and_td.TASKS["pendulum"]})
     monkeypatch.setattr(reinforce_and_td, "RESULTS", experiments)
     reinforce_and_td.main()
     summary = json.loads((experiments / "reinforce_and_td.json").read_text())
-    assert set(summary) == {"pendulum td", "pendulum reinforce"}
+    assert set(summary) == {"quadratic td", "quadratic reinforce"}
     assert all(curve["steps"] for curve in summary.values())
     assert (experiments / "reinforce_and_td.png").read_bytes().startswith(b"\x89PNG")
 
