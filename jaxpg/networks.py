@@ -14,7 +14,8 @@ from jaxpg.features import FEATURES
 from jaxpg.types import PyTree
 
 ACTIVATIONS = {"tanh": jnp.tanh, "relu": jax.nn.relu, "elu": jax.nn.elu, "swish": jax.nn.swish}
-SIGMAS = ("fixed", "learned", "state")  # a constant, a parameter, a function of the state
+# A constant; a parameter that learns; one that the optimizer takes to a given value; a function of the state.
+SIGMAS = ("fixed", "learned", "scheduled", "state")
 
 
 class Networks(NamedTuple):
@@ -106,7 +107,7 @@ class GaussianActor(nn.Module):
         if self.sigma == "state":
             offset = MLP(self.widths, self.action_size, self.output_gain, self.activation)(obs)
             return mean, initial(None, (self.action_size,)) + offset
-        if self.sigma == "learned":
+        if self.sigma in ("learned", "scheduled"):
             return mean, self.param("log_std", initial, (self.action_size,))
         return mean, initial(None, (self.action_size,))
 
@@ -127,7 +128,8 @@ def mlp_networks(
       widths: hidden units by layer, the same for actor and critic.
       activation: a name in `ACTIVATIONS`.
       initial_std: sigma of the Gaussian over u; positive.
-      sigma: a name in `SIGMAS`: as it is, a parameter, or the output of an MLP of its own.
+      sigma: a name in `SIGMAS`: as it is, a parameter, or the output of an MLP of its own. "scheduled" is a parameter
+        like "learned"; that it follows a schedule is the optimizer's doing.
       distribution: what is made of u.
 
     >>> networks = mlp_networks(observation_size=3, action_size=1)

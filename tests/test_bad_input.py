@@ -15,7 +15,7 @@ MISTAKES = {
     "option without its group": (["gamma=0.9"], "unknown option 'gamma': did you mean 'algo.gamma'?"),
     "misspelt environment": (["env=pendulm"], "unknown env 'pendulm': did you mean 'pendulum'?"),
     "misspelt algorithm": (["algo=reinforc"], "unknown algo 'reinforc': did you mean 'reinforce'?"),
-    "unknown algorithm": (["algo=xyz"], "unknown algo 'xyz': known are online, reinforce, td"),
+    "unknown algorithm": (["algo=xyz"], "unknown algo 'xyz': known are online, ppo, reinforce, td"),
     "option of another algorithm": (["algo.baseline=mean"], "unknown option 'algo.baseline'"),
     "option of another environment": (["env.goal_min=0.3"], "unknown option 'env.goal_min'"),
     "word for a number": (["num_envs=many"], "num_envs=many: expected a whole number"),
@@ -48,6 +48,15 @@ MISTAKES = {
         "algo.discounted=true: whole returns have the factors gamma^t in them",
     ),
     "no rewards to sum": (["algo.estimator=n_step", "algo.n=0"], "algo.n=0: must be at least 1"),
+    "environments that do not divide": (
+        ["algo=ppo", "num_envs=64", "algo.minibatches=5"],
+        "algo.minibatches=5 does not divide num_envs=64: the nearest that does is 4",
+    ),
+    "no clip": (["algo=ppo", "algo.clip=0"], "algo.clip=0: must be above 0"),
+    "schedule without an optimizer": (
+        ["algo=online", "network.sigma_is=scheduled"],
+        "network.sigma_is=scheduled: algo=online has no schedules",
+    ),
     "unknown estimator": (["algo.estimator=gae"], "must be td_lambda or td_zero or n_step or monte_carlo"),
     "goal out of reach": (["env=arm", "env.goal_max=2"], "goals must lie in the reachable ring"),
     "unknown brax environment": (

@@ -61,6 +61,19 @@ def test_reinforce_and_td(experiments, monkeypatch):
     assert (experiments / "reinforce_and_td.png").read_bytes().startswith(b"\x89PNG")
 
 
+def test_throughput(experiments, monkeypatch):
+    import throughput
+
+    for name, value in {"NUM_ENVS": (2,), "WIDTHS": (4,), "SEEDS": (1, 2), "SAMPLES": 64, "ROUNDS": 1}.items():
+        monkeypatch.setattr(throughput, name, value)
+    with jax.debug_key_reuse(False):  # see test_vmapped_seeds_are_single_seeds
+        throughput.main()
+    result = json.loads((experiments / "throughput.json").read_text())
+    assert 0 < result["sizes"][0]["share of peak"] < 1
+    assert result["sizes"][0]["training, steps/s"] < result["sizes"][0]["no networks, steps/s"]
+    assert [row["agents"] for row in result["agents"]] == [1, 2]
+
+
 def test_sigma_choices(experiments, monkeypatch):
     import sigma_choices
 

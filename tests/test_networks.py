@@ -65,7 +65,9 @@ def test_sigma_begins_as_asked_and_is_learned_as_asked(make, sigma):
         for path, leaf in jax.tree_util.tree_leaves_with_path(jax.grad(log_prob)(params))
         if "log_std" in jax.tree_util.keystr(path) or "MLP_1" in jax.tree_util.keystr(path)
     ]
-    assert len(of_sigma) == {"fixed": 0, "learned": 1, "state": 2 if make is linear_networks else 6}[sigma]
+    assert (
+        len(of_sigma) == {"fixed": 0, "learned": 1, "scheduled": 1, "state": 2 if make is linear_networks else 6}[sigma]
+    )
     assert all(size > 0 for size in of_sigma)
 
 

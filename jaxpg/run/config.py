@@ -91,6 +91,10 @@ def _complete(config: Config) -> Config:
                 f"the nearest that does is {nearest}"
             ]
         )
+    if config.choices["algo"] == "online" and config.network.sigma_is == "scheduled":
+        raise OptionError(
+            ["network.sigma_is=scheduled: algo=online has no schedules; fixed, learned and state are left"]
+        )
     if config.choices["network"] == "linear" and config.network.features == "radial" and config.network.order < 2:
         raise OptionError([f"network.order={config.network.order}: radial features need at least 2 points of an axis"])
     if config.run.num_seeds + config.run.seed > 2**32:

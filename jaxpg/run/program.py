@@ -10,6 +10,7 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 import optax
 
 import envs
@@ -155,7 +156,7 @@ def make_reuse(config: Config) -> Reuse | None:
 
 
 def make_optimizer(config: Config) -> optax.GradientTransformation:
-    """Adam for actor and critic apart, with shortened gradients and linearly falling step sizes."""
+    """Adam for actor and critic apart, with shortened gradients and linearly falling step sizes; sigma's schedule."""
     algo, run, reuse = config.algo, config.run, make_reuse(config)
     horizon = _ceil(run.total_steps, run.num_envs * run.num_steps) * (reuse.epochs * reuse.minibatches if reuse else 1)
 
@@ -163,9 +164,35 @@ def make_optimizer(config: Config) -> optax.GradientTransformation:
         schedule = optax.linear_schedule(step_size, step_size * algo.final_lr, horizon)
         return optax.chain(optax.clip_by_global_norm(algo.max_gradient_norm), optax.adam(schedule, eps=1e-5))
 
-    return optax.multi_transform(
-        {"actor": adam(algo.actor_lr), "critic": adam(algo.critic_lr)}, {"actor": "actor", "critic": "critic"}
+    optimizers = {"actor": adam(algo.actor_lr), "critic": adam(algo.critic_lr)}
+    if config.network.sigma_is != "scheduled":
+        return optax.multi_transform(optimizers, {"actor": "actor", "critic": "critic"})
+    optimizers["sigma"] = follow(
+        optax.linear_schedule(np.log(config.network.sigma), np.log(config.network.final_sigma), horizon)
     )
+    return optax.multi_transform(optimizers, _labels)
+
+
+def follow(schedule: optax.Schedule) -> optax.GradientTransformation:
+    """Parameters that begin at `schedule(0)` and are `schedule(n)` after n steps, whatever their gradients."""
+
+    def init(params):
+        return jnp.zeros((), jnp.int32)
+
+    def update(gradients, count, params=None):
+        step = schedule(count + 1) - schedule(count)
+        return jax.tree.map(lambda x: jnp.full_like(x, step), gradients), count + 1
+
+    return optax.GradientTransformation(init, update)
+
+
+def _labels(params: Any) -> Any:
+    """Which optimizer each parameter has, where sigma has one of its own."""
+
+    def label(path, _):
+        return "sigma" if jax.tree_util.keystr(path).endswith("['log_std']") else path[0].key
+
+    return jax.tree_util.tree_map_with_path(label, params)
 
 
 def compile_program(

@@ -83,7 +83,10 @@ class Gaussian:
     """Options of the Gaussian policy that all networks share."""
 
     sigma: float = option(0.5, "standard deviation of the policy at the beginning, before tanh", above=0)
-    sigma_is: str = option("learned", "how it goes on: fixed, a parameter, or a function of the state", choices=SIGMAS)
+    sigma_is: str = option(
+        "learned", "how it goes on: a parameter, a schedule, a function of the state", choices=SIGMAS
+    )
+    final_sigma: float = option(0.1, "where sigma_is=scheduled takes it, by equal factors", above=0)
     squash: bool = option(True, "actions tanh(u), within the limits; else u itself")
 
 
