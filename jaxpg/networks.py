@@ -16,6 +16,9 @@ from jaxpg.types import PyTree
 ACTIVATIONS = {"tanh": jnp.tanh, "relu": jax.nn.relu, "elu": jax.nn.elu, "swish": jax.nn.swish}
 # A constant; a parameter that learns; one that the optimizer takes to a given value; a function of the state.
 SIGMAS = ("fixed", "learned", "scheduled", "state")
+# A sigma that depends on the state stays within e^-3 and e^3 times its initial value: without bounds the states that
+# are seldom visited get any sigma, and some seeds of the pendulum end at 10^5.
+SIGMA_RANGE = 3.0
 
 
 class Networks(NamedTuple):
@@ -89,7 +92,8 @@ class GaussianActor(nn.Module):
     Attributes:
       widths, action_size, activation: of the MLP; without hidden layers the mean is linear.
       output_gain: of the mean's last layer; 0 begins with the mean 0 everywhere.
-      initial_std: sigma at the beginning; with sigma "state" it is so where the network's output is 0.
+      initial_std: sigma at the beginning; with sigma "state" it is so where the network's output x is 0, and
+        log(sigma / initial_std) = R tanh(x / R), R = `SIGMA_RANGE`.
       sigma: a name in `SIGMAS`.
     """
 
@@ -106,6 +110,7 @@ class GaussianActor(nn.Module):
         initial = nn.initializers.constant(jnp.log(self.initial_std))
         if self.sigma == "state":
             offset = MLP(self.widths, self.action_size, self.output_gain, self.activation)(obs)
+            offset = SIGMA_RANGE * jnp.tanh(offset / SIGMA_RANGE)
             return mean, initial(None, (self.action_size,)) + offset
         if self.sigma in ("learned", "scheduled"):
             return mean, self.param("log_std", initial, (self.action_size,))
@@ -160,7 +165,7 @@ def linear_networks(
     Args:
       observation_size, action_size: of the environment.
       features, order: phi, a name in `jaxpg.features.FEATURES` and its order.
-      initial_std, sigma, distribution: as in `mlp_networks`; with sigma "state", log sigma is linear in phi too.
+      initial_std, sigma, distribution: as in `mlp_networks`; with sigma "state", x is linear in phi too.
 
     Source: the lesson, section 7.
 

@@ -71,6 +71,18 @@ def test_sigma_begins_as_asked_and_is_learned_as_asked(make, sigma):
     assert all(size > 0 for size in of_sigma)
 
 
+def test_sigma_of_the_state_has_bounds():
+    """Within e^-3 and e^3 of the first value, however large the network's output is; near it sigma is exp of that."""
+    networks = linear_networks(2, 1, initial_std=0.5, sigma="state", distribution=GAUSSIAN)
+    params = networks.init(jax.random.key(0))["actor"]
+    kernel = params["params"]["MLP_1"]["Dense_0"]["kernel"]
+    params["params"]["MLP_1"]["Dense_0"]["kernel"] = jnp.ones_like(kernel)
+    obs = jnp.array([[1e4, 1e4], [-1e4, -1e4], [0.01, 0.02]])
+    _, log_std = networks.policy(params, obs)
+    expected = [0.5 * np.exp(3), 0.5 * np.exp(-3), 0.5 * np.exp(0.03)]
+    np.testing.assert_allclose(np.exp(log_std[:, 0]), expected, rtol=1e-4)
+
+
 def test_linear_networks_are_linear():
     """mu = W phi + b and V = w' phi + c: zero at first; second differences along any line in phi vanish."""
     networks = linear_networks(2, 1, features="polynomial", order=2)
