@@ -29,6 +29,7 @@ def experiments(monkeypatch, command_environment, tmp_path):
 
     monkeypatch.setattr(commands, "train", tiny)
     monkeypatch.setattr(commands, "RESULTS", tmp_path)
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))  # default_runs has one of its own, which ends with it
     yield tmp_path
     for name in SCRIPTS:
         sys.modules.pop(name, None)
