@@ -7,6 +7,7 @@ import sys
 import pytest
 
 from jaxpg import evaluate, train
+from jaxpg.run import cache
 from jaxpg.run.errors import run_command
 
 MISTAKES = {
@@ -73,6 +74,15 @@ MISTAKES = {
         "/nowhere/at/all is not a run folder: it has no config.yaml",
     ),
 }
+
+
+@pytest.fixture(scope="module", autouse=True)
+def own_cache_folder(tmp_path_factory):
+    """The commands run in this process: what they compile is not for the cache folder of who tests."""
+    folder = tmp_path_factory.mktemp("cache") / "jaxpg"
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(cache, "cache_folder", lambda: folder)
+        yield
 
 
 def run(main, arguments, monkeypatch, capsys):

@@ -117,6 +117,19 @@ def test_online_pendulum(experiments, monkeypatch):
     assert (experiments / "online_pendulum.png").read_bytes().startswith(b"\x89PNG")
 
 
+def test_startup(experiments, monkeypatch):
+    import startup
+
+    sizes = ("num_envs=2", "num_steps=4", "eval_episodes=2", "env.episode_length=8", "total_steps=16")
+    monkeypatch.setattr(startup, "ARGUMENTS", ("env=quadratic", "network=linear", *sizes))
+    startup.main()
+    runs = json.loads((experiments / "startup.json").read_text())
+    assert set(runs) == {"train, cold", "train, warm", "evaluate, cold", "evaluate, warm"}
+    for name in ("train, cold", "train, warm"):
+        assert 0 < runs[name]["of it tracing"]["seconds"] < runs[name]["tracing and compiling"]["seconds"]
+        assert runs[name]["tracing and compiling"]["seconds"] < runs[name]["whole process"]["seconds"]
+
+
 def test_estimator_table(experiments, monkeypatch, capsys):
     import estimator_table
 
