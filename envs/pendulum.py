@@ -47,7 +47,7 @@ TRAINING = {
         "algo.reward_scale": 0.02,
         "network.activation": "relu",
         "network.sigma": 1.0,
-        "network.sigma_is": "fixed",  # where it is learned, one seed in ten or so is never solved
+        "network.sigma_is": "fixed",  # where it is learned, single seeds are never solved
     },
     "ppo": {
         "num_envs": 64,
