@@ -16,6 +16,7 @@ from pathlib import Path
 from commands import RESULTS, learning_curve, train, write_json
 from matplotlib.figure import Figure
 
+TASK = "pendulum"
 NUM_SEEDS = 5
 TOTAL_STEPS = 5_000_000
 CHOICES = {
@@ -34,7 +35,7 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as folder:
         for number, (label, options) in enumerate(CHOICES.items()):
             run = Path(folder) / str(number)
-            train(run, "env=pendulum", "algo=td", f"num_seeds={NUM_SEEDS}", f"total_steps={TOTAL_STEPS}", *options)
+            train(run, f"env={TASK}", "algo=td", f"num_seeds={NUM_SEEDS}", f"total_steps={TOTAL_STEPS}", *options)
             summary[label] = {
                 "return": learning_curve(left, run, "eval_return", label),
                 "sigma": learning_curve(right, run, "sigma", label),

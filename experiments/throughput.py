@@ -33,6 +33,7 @@ from jaxpg.run.program import make_algorithm, make_env
 from jaxpg.training import initial_state, train_scan
 from jaxpg.vector_env import vectorize
 
+TASK = "pendulum"
 NUM_ENVS = (32, 256, 1024)
 WIDTHS = (32, 64, 128)
 SEEDS = (1, 8, 64)
@@ -43,7 +44,7 @@ ROUNDS = 7
 
 def configured(num_envs: int, width: int) -> Config:
     sizes = f"num_envs={num_envs}", f"num_steps={NUM_STEPS}", f"network.widths=[{width},{width}]"
-    return compose(["env=pendulum", "algo=td", "network.activation=tanh", *sizes])
+    return compose([f"env={TASK}", "algo=td", "network=mlp", "network.activation=tanh", *sizes])
 
 
 class Standing:
@@ -105,9 +106,9 @@ def seconds(programs: dict[str, tuple[Callable, Any]]) -> tuple[dict[str, float]
     return best, {name: run.memory_analysis().temp_size_in_bytes for name, (run, _) in compiled.items()}
 
 
-def operations(width: int) -> int:
-    """Multiplications and additions of the networks for one sample."""
-    one_pass = 2 * (3 * width + width * width + width)
+def operations(observation_size: int, width: int) -> int:
+    """Multiplications and additions of the networks for one sample, with one action."""
+    one_pass = 2 * (observation_size * width + width * width + width)
     return one_pass * (2 * 2 + 2 * 2)  # both networks: two passes each, and two of a pass's size backwards
 
 
@@ -134,7 +135,9 @@ def sizes() -> list[dict[str, Any]]:
                     for name in ("training", "no physics", "no networks")
                 }
                 | {
-                    "share of peak": round(operations(width) * samples / took["training"] / peak, 3),
+                    "share of peak": round(
+                        operations(env.observation_size, width) * samples / took["training"] / peak, 3
+                    ),
                     "peak, GFLOP/s": round(peak / 1e9, 1),
                     "memory, MB": round(memory["training"] / 1e6, 1),
                 }
@@ -144,7 +147,7 @@ def sizes() -> list[dict[str, Any]]:
 
 
 def agents() -> list[dict[str, Any]]:
-    config = compose(["env=pendulum", "algo=td"])
+    config = compose([f"env={TASK}", "algo=td"])
     env = make_env(config)
     took, _ = seconds({str(number): training(config, env, number) for number in SEEDS})
     return [

@@ -65,19 +65,23 @@ def test_reinforce_and_td(experiments, monkeypatch):
 def test_throughput(experiments, monkeypatch):
     import throughput
 
-    for name, value in {"NUM_ENVS": (2,), "WIDTHS": (4,), "SEEDS": (1, 2), "SAMPLES": 64, "ROUNDS": 1}.items():
+    sizes = {"NUM_ENVS": (16,), "WIDTHS": (32,), "SEEDS": (1, 2), "SAMPLES": 2048, "ROUNDS": 1}
+    for name, value in {"TASK": "quadratic", **sizes}.items():
         monkeypatch.setattr(throughput, name, value)
     with jax.debug_key_reuse(False):  # see test_vmapped_seeds_are_single_seeds
         throughput.main()
     result = json.loads((experiments / "throughput.json").read_text())
-    assert 0 < result["sizes"][0]["share of peak"] < 1
-    assert result["sizes"][0]["training, steps/s"] < result["sizes"][0]["no networks, steps/s"]
+    assert throughput.operations(3, 4) == 8 * 2 * (3 * 4 + 4 * 4 + 4)
+    (row,) = result["sizes"]
+    of_peak = throughput.operations(1, 32) * row["training, steps/s"] / (1e9 * row["peak, GFLOP/s"])
+    assert 0 < row["share of peak"] == pytest.approx(of_peak, abs=2e-3)
     assert [row["agents"] for row in result["agents"]] == [1, 2]
 
 
 def test_sigma_choices(experiments, monkeypatch):
     import sigma_choices
 
+    monkeypatch.setattr(sigma_choices, "TASK", "quadratic")
     monkeypatch.setattr(sigma_choices, "NUM_SEEDS", 2)
     monkeypatch.setattr(sigma_choices, "CHOICES", {"state": sigma_choices.CHOICES["of the state, from 1"]})
     monkeypatch.setattr(sigma_choices, "RESULTS", experiments)
