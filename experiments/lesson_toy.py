@@ -9,7 +9,7 @@ its own. Beside it the project's defaults: `python -m jaxpg.train env=quadratic 
 
 What one sees: single episodes without a baseline are so noisy that 15 of the lesson's 100 seeds leave the stable gains
 (-20 < theta_1 < 0) within 500 updates and never return. The others have a median cost of 2.8 times the best after the
-lesson's 500 updates, and of 1.5 times after 5,000. The defaults end within 0.4 % of the best with every seed.
+lesson's 500 updates, and of 1.5 times after 5,000. The defaults end within 0.5 % of the best with every seed.
 
 Writes results/lesson_toy.png and results/lesson_toy.json.
 """
