@@ -48,3 +48,16 @@ def test_reuse_is_what_the_options_say():
     options = ("algo.epochs=3", "algo.minibatches=2", "algo.clip=null", "algo.max_kl=0.1", "algo.value_clip=0.5")
     assert make_reuse(compose(["algo=ppo", *options])) == Reuse(3, 2, None, 0.5, 0.1)
     assert make_reuse(compose(["algo=td"])) is None
+
+
+@pytest.mark.parametrize("algo", ["td", "ppo"])
+def test_training_episodes_are_cut_as_by_a_shorter_time_limit(algo):
+    """To the bit the training with that limit, where evaluations keep the longer one; and not that without the cut."""
+
+    def trained(limit, *options):
+        config = compose([*SIZES[:-1], f"env.episode_length={limit}", f"algo={algo}", *options])
+        return jax.jit(lambda key: train_scan(make_algorithm(config, make_env(config)), key, 4))(jax.random.key(0))
+
+    (state, metrics), shorter = trained(8, "algo.episode_length=4"), trained(4)
+    jax.tree.map(np.testing.assert_array_equal, (state, metrics), shorter)
+    assert metrics["episodes"].sum() > 1.5 * trained(8)[1]["episodes"].sum()

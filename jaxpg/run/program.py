@@ -124,7 +124,7 @@ def make_networks(config: Config, env: Any) -> Networks:
 def make_algorithm(config: Config, env: Any) -> Algorithm:
     """One agent's algorithm, as pure functions."""
     algo, run = config.algo, config.run
-    batch = vectorize(env, run.num_envs, config.env.episode_length)
+    batch = vectorize(env, run.num_envs, training_length(config))
     networks = make_networks(config, env)
     if config.choices["algo"] == "online":
         return online_actor_critic(batch, networks, num_steps=run.num_steps, **dataclasses.asdict(algo))
@@ -139,6 +139,11 @@ def make_algorithm(config: Config, env: Any) -> Algorithm:
         normalize_observations=algo.normalize_observations,
         normalize_advantages=algo.normalize_advantages,
     )
+
+
+def training_length(config: Config) -> int:
+    """Steps of a training episode; TD may cut it before the time limit, where it bootstraps all the same."""
+    return getattr(config.algo, "episode_length", None) or config.env.episode_length
 
 
 def make_method(config: Config) -> Method:

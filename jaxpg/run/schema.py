@@ -43,6 +43,9 @@ class TD(Learning):
     estimator: str = option("td_lambda", "advantage: td_zero and monte_carlo are lambda 0 and 1", choices=ESTIMATORS)
     n: int = option(5, "rewards that n_step sums", at_least=1)
     lambda_: float = option(0.95, "weight of longer returns: 0 is TD(0), 1 Monte Carlo", at_least=0, at_most=1)
+    episode_length: int | None = option(
+        None, "steps after which a training episode is cut and begun anew [default: the environment's]", at_least=1
+    )
 
 
 @dataclass(frozen=True)
