@@ -98,7 +98,7 @@ def test_stopped_and_resumed_is_never_stopped(
 
 def test_resume_with_more_steps(command, tmp_path):
     folder = tmp_path / "a run, (with) odd name=x äß"
-    assert command("train", *TINY, "total_steps=256", f"run_dir={folder}").returncode == 0
+    assert command("train", "env=quadratic", *TINY, "total_steps=256", f"run_dir={folder}").returncode == 0
     assert "is finished" in command("train", f"resume={folder}").stdout
     result = command("train", f"resume={folder}", "total_steps=512")
     assert result.returncode == 0, result.stderr
@@ -141,11 +141,10 @@ def test_evaluation_of_a_run(uninterrupted, command):
     assert answers[0] != answers[2]
 
 
-def test_gymnasium_plays_the_same_episodes(command, tmp_path):
+def test_gymnasium_plays_the_same_episodes(uninterrupted, command):
     """Mean returns in Gymnasium and in MJX agree within 4 standard errors of their difference."""
-    folder = tmp_path / "run"
-    assert command("train", *TINY, "total_steps=256", f"run_dir={folder}").returncode == 0
-    arguments = (f"run={folder}", "episodes=200", "json=true")
+    folder, _ = uninterrupted
+    arguments = (f"run={folder}", "episodes=200", "json=true", "env.episode_length=200")
     answers = [
         json.loads(command("evaluate", *arguments, f"backend={backend}").stdout.splitlines()[-1])
         for backend in ("mjx", "gymnasium")
