@@ -1,0 +1,51 @@
+"""jaxpg: the program of `python -m jaxpg.train env=pendulum algo=... seed=...`, chunk after chunk without a run folder.
+
+What is left out is what no other contestant does either: evaluations on the clock, checkpoints, TensorBoard. The
+updates, and so the policies, are those of the command, bit for bit. Options but the recorder's are the command's.
+"""
+
+from __future__ import annotations
+
+from protocol import TORQUE_LIMIT, begin
+
+OPTIONS, RECORDER = begin()  # before the imports, which are part of what is timed
+
+import sys  # noqa: E402
+from pathlib import Path  # noqa: E402
+
+import jax  # noqa: E402
+
+sys.path.insert(0, str(Path(__file__).parents[2]))  # the repository, if it is not installed
+from jaxpg.actor_critic import deterministic_policy  # noqa: E402
+from jaxpg.run.config import compose  # noqa: E402
+from jaxpg.run.program import compile_program, make_env, make_networks, plan  # noqa: E402
+from jaxpg.run.runtime import prepare  # noqa: E402
+from jaxpg.run.state import current_policy  # noqa: E402
+
+RECORDERS = ("out", "budget", "started")
+
+
+def main() -> None:
+    config = compose(["env=pendulum", *(f"{name}={value}" for name, value in OPTIONS.items() if name not in RECORDERS)])
+    prepare(config)
+    env, schedule = make_env(config), plan(config)
+    program = compile_program(config, env, schedule.chunk)
+    networks = make_networks(config, env)
+
+    @jax.jit
+    def run(policy, obs):
+        policy = jax.tree.map(lambda x: x[0], policy)  # of the only agent
+        return TORQUE_LIMIT * deterministic_policy(networks, policy.params, policy.normalizer)(obs)
+
+    train, update = program.init().train, 0
+    RECORDER.ready()
+    while update < schedule.num_updates and not RECORDER.over:
+        train, _ = program.advance(train)
+        update = int(train.update[0])
+        if RECORDER.due or update >= schedule.num_updates:
+            policy = current_policy(train)
+            RECORDER.look(update * schedule.steps_per_update, lambda obs, policy=policy: run(policy, obs))
+
+
+if __name__ == "__main__":
+    main()
