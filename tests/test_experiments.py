@@ -1,14 +1,17 @@
 """The experiments run from beginning to end, here with tiny sizes; their figures come from the full ones."""
 
 import json
+import subprocess
 import sys
 from pathlib import Path
 
+import gymnasium
 import jax
 import numpy as np
 import pytest
 
 EXPERIMENTS = Path(__file__).parent.parent / "experiments"
+PEERS = EXPERIMENTS / "peers"
 SCRIPTS = [script.stem for script in EXPERIMENTS.glob("*.py")]
 
 
@@ -157,3 +160,71 @@ def test_gradient_variance(experiments, monkeypatch):
     assert summary["squared error x episodes"]["none"][1] > 3 * summary["squared error x episodes"]["value"][1]
     assert summary["squared bias"][1] == 0
     assert (experiments / "gradient_variance.png").read_bytes().startswith(b"\x89PNG")
+
+
+STUB = f"""
+import sys
+sys.path.insert(0, {str(PEERS)!r})
+from protocol import begin
+options, recorder = begin()
+recorder.ready()
+for steps, torque in ((100, 0.0), (200, float(options["torque"]))):
+    recorder.look(steps, lambda obs: torque - obs[:, 2])
+"""
+
+
+def test_time_to_solve(experiments, monkeypatch, tmp_path, capsys):
+    import time_to_solve
+
+    stub = tmp_path / "stub.py"
+    stub.write_text(STUB, encoding="utf-8")
+    contestants = [
+        time_to_solve.Contestant("stub", str(stub), 30, options=("torque=0.1",)),
+        time_to_solve.Contestant("broken", str(stub), 30),
+        time_to_solve.Contestant("absent", str(stub), 30, venv="sb3"),
+    ]
+    monkeypatch.setattr(time_to_solve, "CONTESTANTS", contestants)
+    monkeypatch.setattr(time_to_solve, "RESULTS", experiments)
+    monkeypatch.setattr(time_to_solve, "TARGETS", (-2000, 0))
+    monkeypatch.setattr(time_to_solve, "JAXPG", {"TD": ()})
+    monkeypatch.setattr(time_to_solve, "evaluate", lambda folder, *options: {"mean": -1.0, "stderr": 0.1})
+    time_to_solve.main(["--seeds", "2", "--venvs", str(tmp_path / "none")])
+    printed = capsys.readouterr().out
+    assert "absent is left out; to install it:" in printed
+    assert "broken, seed 1: failed, KeyError: 'torque'" in printed
+    assert "100 steps | not within 30 s |" in printed
+    rows = json.loads((experiments / "time_to_solve.json").read_text())["contestants"]
+    assert rows["stub"]["curves"][1]["steps"] == [100, 200]
+    assert (experiments / "time_to_solve.png").read_bytes().startswith(b"\x89PNG")
+
+
+def test_jaxpg_is_a_contestant(tmp_path):
+    """Its curve ends with the last update; a smaller network only, for the sake of time."""
+    out = tmp_path / "curve.json"
+    options = ["algo=td", "total_steps=2000", "log_interval=512", f"out={out}"]
+    subprocess.run([sys.executable, PEERS / "own.py", *options], check=True)
+    (point,) = json.loads(out.read_text())
+    assert point["steps"] == 2048
+    assert point["seconds_training"] < point["seconds_since_process_start"]
+
+
+def test_the_evaluation_is_gymnasiums(monkeypatch):
+    """All 200 starts, under a controller in float32 that swings up and balances."""
+    monkeypatch.syspath_prepend(str(PEERS))
+    import protocol
+
+    def act(obs):
+        cos, sin, speed = obs.T
+        energy = speed**2 / 6 + 5 * (cos - 1)
+        return np.where(cos > 0.9, -8 * sin - 2 * speed, -np.sign(speed) * energy)
+
+    pendulums = gymnasium.make_vec("Pendulum-v1", num_envs=protocol.NUM_STARTS, vectorization_mode="sync")
+    obs, _ = pendulums.reset(seed=list(range(protocol.NUM_STARTS)))
+    np.testing.assert_array_equal(obs, protocol.observe(protocol.starts()))
+    returns = np.zeros(protocol.NUM_STARTS)
+    for _ in range(protocol.EPISODE_LENGTH):
+        obs, reward, _, truncated, _ = pendulums.step(act(obs)[:, None])
+        returns += reward
+    assert truncated.all()
+    np.testing.assert_allclose(protocol.play(act), returns, rtol=1e-6)
+    assert returns.mean() > -400
