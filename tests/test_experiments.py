@@ -192,7 +192,7 @@ def test_time_to_solve(experiments, monkeypatch, tmp_path, capsys):
     printed = capsys.readouterr().out
     assert "absent is left out; to install it:" in printed
     assert "broken, seed 1: failed, KeyError: 'torque'" in printed
-    assert "100 steps | not within 30 s |" in printed
+    assert "100 steps | not within " in printed
     rows = json.loads((experiments / "time_to_solve.json").read_text())["contestants"]
     assert rows["stub"]["curves"][1]["steps"] == [100, 200]
     assert (experiments / "time_to_solve.png").read_bytes().startswith(b"\x89PNG")
