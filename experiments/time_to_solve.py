@@ -44,7 +44,7 @@ ROOT = Path(__file__).parents[1]
 PEERS = Path(__file__).parent / "peers"
 TARGETS = (-200, -160, -150, -145)
 BEST_POSSIBLE = -140.6  # from the 200 starts
-JAXPG = {"TD": ("algo=td",)}
+JAXPG = {"PPO": ("algo=ppo",), "TD": ("algo=td",)}
 
 
 @dataclass(frozen=True)

@@ -169,13 +169,12 @@ def test_several_seeds_of_the_arm(command, tmp_path):
     assert answer["success"] is not None
 
 
-def test_brax_environments_train(command, tmp_path):
+# With mjx, brax's default here, it takes two minutes to compile.
+@pytest.mark.parametrize("backend", ["spring", pytest.param("mjx", marks=pytest.mark.study)])
+def test_brax_environments_train(command, tmp_path, backend):
     folder = tmp_path / "run"
-    result = command(
-        *("train", "env=brax", "env.name=inverted_pendulum", "env.episode_length=8", *TINY, "total_steps=256"),
-        f"run_dir={folder}",
-        timeout=900,
-    )
+    brax = ("env=brax", "env.name=inverted_pendulum", f"env.backend={backend}", "env.episode_length=8")
+    result = command("train", *brax, *TINY, "total_steps=256", f"run_dir={folder}", timeout=900)
     assert result.returncode == 0, result.stderr
     assert result.stderr == ""
     assert len(metrics(folder)) == 4
