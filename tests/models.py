@@ -121,3 +121,15 @@ def random_states(model, n, seed=0):
             qpos[:, begin : begin + 4] /= np.linalg.norm(qpos[:, begin : begin + 4], axis=1, keepdims=True)
     limit = np.where(model.actuator_ctrllimited, model.actuator_ctrlrange[:, 1], 2.0)
     return qpos, random.normal(size=(n, model.nv)), limit * random.uniform(-1.2, 1.2, (n, model.nu))
+
+
+def by_mujoco(model, states):
+    """qpos and qvel after `mj_step` from each of the states, in float64."""
+    data = mujoco.MjData(model)
+    results = []
+    for qpos, qvel, ctrl in zip(*states, strict=True):
+        mujoco.mj_resetData(model, data)
+        data.qpos[:], data.qvel[:], data.ctrl[:] = qpos, qvel, ctrl
+        mujoco.mj_step(model, data)
+        results.append((data.qpos.copy(), data.qvel.copy()))
+    return [np.stack(x) for x in zip(*results, strict=True)]

@@ -31,18 +31,6 @@ def in_float32(arrays):
     return [jnp.asarray(x, jnp.float32) for x in arrays]
 
 
-def by_mujoco(model, states):
-    """qpos and qvel after `mj_step` from each of the states, in float64."""
-    data = mujoco.MjData(model)
-    results = []
-    for qpos, qvel, ctrl in zip(*states, strict=True):
-        mujoco.mj_resetData(model, data)
-        data.qpos[:], data.qvel[:], data.ctrl[:] = qpos, qvel, ctrl
-        mujoco.mj_step(model, data)
-        results.append((data.qpos.copy(), data.qvel.copy()))
-    return [np.stack(x) for x in zip(*results, strict=True)]
-
-
 def by_mjx(model, states):
     """The same by `mjx.step`, one state after the other: many models are very slow when they are batched."""
     step = jax.jit(single_step(model, (*STATE, "ctrl"), STATE)[0])
@@ -64,7 +52,7 @@ def test_single_steps_in_float32(name):
     model = models.make(name)
     states = models.random_states(model, 10_000)
     ours = jax.jit(jax.vmap(compile_step(model)))(*in_float32(states))
-    for mine, true in zip(ours, by_mujoco(model, states), strict=True):
+    for mine, true in zip(ours, models.by_mujoco(model, states), strict=True):
         size = np.maximum(1.0, np.abs(true).max(1, keepdims=True))
         np.testing.assert_allclose(mine / size, true / size, rtol=0, atol=tolerance)
 
@@ -137,7 +125,7 @@ def test_random_trees(xml, seed):
     with jax.enable_x64(True):
         model = mujoco.MjModel.from_xml_string(xml)
         states = models.random_states(model, 20, seed)
-        agree(jax.vmap(compile_step(model))(*map(jnp.asarray, states)), by_mujoco(model, states), 1e-10)
+        agree(jax.vmap(compile_step(model))(*map(jnp.asarray, states)), models.by_mujoco(model, states), 1e-10)
 
 
 def test_substeps_are_steps_with_the_control_held():
