@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from matplotlib.axes import Axes
+from matplotlib.figure import Figure
 
 from jaxpg.run.figures import draw_curve, series
 from jaxpg.run.folder import RunFolder, read_metrics
@@ -45,6 +46,11 @@ def learning_curve(axes: Axes, folder: Path, metric: str, label: str) -> dict[st
         "low": low.round(3).tolist(),
         "high": high.round(3).tolist(),
     }
+
+
+def write_figure(name: str, figure: Figure) -> None:
+    RESULTS.mkdir(exist_ok=True)
+    figure.savefig(RESULTS / name, dpi=110)
 
 
 def write_json(name: str, content: Any) -> None:

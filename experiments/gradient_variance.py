@@ -17,7 +17,7 @@ import functools
 
 import jax
 import numpy as np
-from commands import RESULTS, write_json
+from commands import write_figure, write_json
 from linear_quadratic import (
     UNBIASED,
     Played,
@@ -79,8 +79,7 @@ def main() -> None:
     for axes in (left, right):
         axes.grid(alpha=0.3)
         axes.legend(fontsize=8)
-    RESULTS.mkdir(exist_ok=True)
-    figure.savefig(RESULTS / "gradient_variance.png", dpi=110)
+    write_figure("gradient_variance.png", figure)
     summary = {
         "batch sizes": list(BATCH_SIZES),
         "squared error x episodes": {name: [round(x, 3) for x in values] for name, values in errors.items()},

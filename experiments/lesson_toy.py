@@ -21,7 +21,7 @@ import json
 import jax
 import jax.numpy as jnp
 import numpy as np
-from commands import RESULTS, write_json
+from commands import write_figure, write_json
 from matplotlib.figure import Figure
 
 from envs.quadratic import LinearQuadratic, Policy, QuadraticConfig, best_policy, chain, objective
@@ -131,8 +131,7 @@ def main() -> None:
     axes.axvline(500, color="gray", lw=0.8, ls="--")
     axes.grid(alpha=0.3)
     axes.legend(fontsize=8)
-    RESULTS.mkdir(exist_ok=True)
-    figure.savefig(RESULTS / "lesson_toy.png", dpi=110)
+    write_figure("lesson_toy.png", figure)
     write_json("lesson_toy.json", summary)
     print(json.dumps(summary, indent=1))
 

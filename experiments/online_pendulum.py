@@ -19,7 +19,7 @@ import json
 
 import jax
 import numpy as np
-from commands import RESULTS, write_json
+from commands import write_figure, write_json
 from matplotlib.figure import Figure
 
 from jaxpg.run.config import compose
@@ -80,8 +80,7 @@ def main() -> None:
     left.legend(loc="lower right", fontsize=8)
     for axes in (left, right):
         axes.grid(alpha=0.3)
-    RESULTS.mkdir(exist_ok=True)
-    figure.savefig(RESULTS / "online_pendulum.png", dpi=110)
+    write_figure("online_pendulum.png", figure)
     write_json("online_pendulum.json", summary)
     print(json.dumps(summary["step sizes"], indent=1))
 

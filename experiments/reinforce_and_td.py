@@ -12,7 +12,7 @@ from __future__ import annotations
 import tempfile
 from pathlib import Path
 
-from commands import RESULTS, learning_curve, train, write_json
+from commands import learning_curve, train, write_figure, write_json
 from matplotlib.figure import Figure
 
 NUM_SEEDS = 5
@@ -37,8 +37,7 @@ def main() -> None:
             axes.set(title=task, xlabel="environment steps", ylabel=ylabel)
             axes.grid(alpha=0.3)
             axes.legend(loc="lower right", fontsize=8)
-    RESULTS.mkdir(exist_ok=True)
-    figure.savefig(RESULTS / "reinforce_and_td.png", dpi=110)
+    write_figure("reinforce_and_td.png", figure)
     write_json("reinforce_and_td.json", summary)
 
 

@@ -13,7 +13,7 @@ from __future__ import annotations
 import tempfile
 from pathlib import Path
 
-from commands import RESULTS, learning_curve, train, write_json
+from commands import learning_curve, train, write_figure, write_json
 from matplotlib.figure import Figure
 
 TASK = "pendulum"
@@ -46,8 +46,7 @@ def main() -> None:
         axes.set(xlabel="environment steps")
         axes.grid(alpha=0.3)
         axes.legend(fontsize=8)
-    RESULTS.mkdir(exist_ok=True)
-    figure.savefig(RESULTS / "sigma_choices.png", dpi=110)
+    write_figure("sigma_choices.png", figure)
     write_json("sigma_choices.json", summary)
 
 

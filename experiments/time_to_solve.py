@@ -37,7 +37,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from commands import RESULTS, evaluate, train, write_json
+from commands import evaluate, train, write_figure, write_json
 from matplotlib.figure import Figure
 
 ROOT = Path(__file__).parents[1]
@@ -133,7 +133,7 @@ def table(results: dict[Contestant, list[list[dict[str, float]]]]) -> str:
     return "\n".join(lines)
 
 
-def draw(results: dict[Contestant, list[list[dict[str, float]]]], path: Path) -> None:
+def draw(results: dict[Contestant, list[list[dict[str, float]]]]) -> Figure:
     """Return against seconds from the start of the process: median and range of the seeds."""
     figure = Figure(figsize=(8, 4.6), layout="constrained")
     axes = figure.subplots()
@@ -147,7 +147,7 @@ def draw(results: dict[Contestant, list[list[dict[str, float]]]], path: Path) ->
     axes.set_ylabel("mean return from 200 starts, Pendulum-v1")
     axes.grid(alpha=0.3, which="both")
     axes.legend(loc="lower left", fontsize=8)
-    figure.savefig(path, dpi=110)
+    return figure
 
 
 def on_common_times(curves: list[list[dict[str, float]]], number: int = 400) -> tuple[np.ndarray, np.ndarray]:
@@ -216,8 +216,7 @@ def main(arguments: list[str]) -> None:
     results = compete(chosen, options.seeds, options.venvs)
     print("\nseconds from the start of the process (training alone), environment steps\n")
     print(table(results))
-    RESULTS.mkdir(exist_ok=True)
-    draw(results, RESULTS / "time_to_solve.png")
+    write_figure("time_to_solve.png", draw(results))
     plain = plain_commands() if options.only is None else {}
     for name, found in plain.items():
         print(f"{name}, the plain command, seed 0: {found['seconds']} s, {found['mean']:.1f} in Gymnasium at the end")

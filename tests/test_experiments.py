@@ -58,7 +58,6 @@ def test_reinforce_and_td(experiments, monkeypatch):
 
     monkeypatch.setattr(reinforce_and_td, "NUM_SEEDS", 2)
     monkeypatch.setattr(reinforce_and_td, "TASKS", {"quadratic": reinforce_and_td.TASKS["pendulum"]})
-    monkeypatch.setattr(reinforce_and_td, "RESULTS", experiments)
     reinforce_and_td.main()
     summary = json.loads((experiments / "reinforce_and_td.json").read_text())
     assert set(summary) == {"quadratic td", "quadratic reinforce"}
@@ -88,7 +87,6 @@ def test_sigma_choices(experiments, monkeypatch):
     monkeypatch.setattr(sigma_choices, "TASK", "quadratic")
     monkeypatch.setattr(sigma_choices, "NUM_SEEDS", 2)
     monkeypatch.setattr(sigma_choices, "CHOICES", {"state": sigma_choices.CHOICES["of the state, from 1"]})
-    monkeypatch.setattr(sigma_choices, "RESULTS", experiments)
     sigma_choices.main()
     summary = json.loads((experiments / "sigma_choices.json").read_text())
     assert summary["state"]["return"]["seeds"] == 2
@@ -99,7 +97,6 @@ def test_sigma_choices(experiments, monkeypatch):
 def test_lesson_toy(experiments, monkeypatch):
     import lesson_toy
 
-    monkeypatch.setattr(lesson_toy, "RESULTS", experiments)
     monkeypatch.setattr(lesson_toy, "NUM_UPDATES", 5)
     monkeypatch.setattr(lesson_toy, "LESSON_SEEDS", 2)
     monkeypatch.setattr(lesson_toy, "DEFAULT_SEEDS", 2)
@@ -113,7 +110,6 @@ def test_lesson_toy(experiments, monkeypatch):
 def test_online_pendulum(experiments, monkeypatch):
     import online_pendulum
 
-    monkeypatch.setattr(online_pendulum, "RESULTS", experiments)
     monkeypatch.setattr(online_pendulum, "NUM_SEEDS", 2)
     monkeypatch.setattr(online_pendulum, "FACTORS", (1.0,))
     monkeypatch.setattr(online_pendulum, "NETWORKS", {"linear": ()})
@@ -152,7 +148,6 @@ def test_estimator_table(experiments, monkeypatch, capsys):
 def test_gradient_variance(experiments, monkeypatch):
     import gradient_variance
 
-    monkeypatch.setattr(gradient_variance, "RESULTS", experiments)
     monkeypatch.setattr(gradient_variance, "NUM_EPISODES", 4096)
     monkeypatch.setattr(gradient_variance, "BATCH_SIZES", (2, 64))
     monkeypatch.setattr(gradient_variance, "LAMBDAS", np.array([0.0, 1.0]))
@@ -185,7 +180,6 @@ def test_time_to_solve(experiments, monkeypatch, tmp_path, capsys):
         time_to_solve.Contestant("absent", str(stub), 30, venv="sb3"),
     ]
     monkeypatch.setattr(time_to_solve, "CONTESTANTS", contestants)
-    monkeypatch.setattr(time_to_solve, "RESULTS", experiments)
     monkeypatch.setattr(time_to_solve, "TARGETS", (-2000, 0))
     monkeypatch.setattr(time_to_solve, "JAXPG", {"TD": ()})
     monkeypatch.setattr(time_to_solve, "evaluate", lambda folder, *options: {"mean": -1.0, "stderr": 0.1})
@@ -200,7 +194,7 @@ def test_time_to_solve(experiments, monkeypatch, tmp_path, capsys):
 
 
 def test_jaxpg_is_a_contestant(tmp_path):
-    """Its curve ends with the last update; a smaller network only, for the sake of time."""
+    """Its curve ends with the last update."""
     out = tmp_path / "curve.json"
     options = ["algo=td", "total_steps=2000", "log_interval=512", f"out={out}"]
     subprocess.run([sys.executable, PEERS / "own.py", *options], check=True)

@@ -28,10 +28,10 @@ INTERVAL = 0.5, 0.02  # between two evaluations, at least: seconds of training, 
 Act = Callable[[np.ndarray], Any]  # observations [N, 3] in float32 -> torques [N] or [N, 1], in N m
 
 
-def starts(number: int = NUM_STARTS) -> np.ndarray:
-    """(theta, theta') of `gymnasium.make("Pendulum-v1").reset(seed=i)` for i = 0, 1, ...; `[number, 2]`."""
+def starts() -> np.ndarray:
+    """(theta, theta') of `gymnasium.make("Pendulum-v1").reset(seed=i)` for i = 0, 1, ...; `[NUM_STARTS, 2]`."""
     high = np.array([np.pi, 1.0])
-    return np.stack([np.random.Generator(np.random.PCG64(i)).uniform(-high, high) for i in range(number)])
+    return np.stack([np.random.Generator(np.random.PCG64(i)).uniform(-high, high) for i in range(NUM_STARTS)])
 
 
 def observe(state: np.ndarray) -> np.ndarray:
@@ -49,11 +49,11 @@ def step(state: np.ndarray, torque: np.ndarray) -> tuple[np.ndarray, np.ndarray]
     return np.stack([theta + DT * speed, speed], axis=1), reward
 
 
-def play(act: Act, number: int = NUM_STARTS) -> np.ndarray:
-    """Returns of one episode from each of the fixed starts, `[number]`."""
-    state, total = starts(number), np.zeros(number)
+def play(act: Act) -> np.ndarray:
+    """Returns of one episode from each of the fixed starts, `[NUM_STARTS]`."""
+    state, total = starts(), np.zeros(NUM_STARTS)
     for _ in range(EPISODE_LENGTH):
-        torque = np.asarray(act(observe(state)), np.float64).reshape(number)
+        torque = np.asarray(act(observe(state)), np.float64).reshape(NUM_STARTS)
         state, reward = step(state, torque)
         total += reward
     return total
