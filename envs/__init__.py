@@ -21,8 +21,9 @@ class Entry(NamedTuple):
     Attributes:
       config: dataclass of its options; has `episode_length`.
       build: `build(config) -> env`.
-      training: tuned training values by algorithm, under the training command's option names; `network` among them
-        chooses the network, and options of another network than the chosen one do not count.
+      training: tuned training values by algorithm, under the training command's option names; the first algorithm is
+        the environment's default. `network` among the values chooses the network, and options of another network than
+        the chosen one do not count.
     """
 
     config: type

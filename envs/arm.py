@@ -6,8 +6,8 @@ torques tau_t and d_t = |x_ee(q_t) - x_goal| the reward is, of the state and act
     lesson:   r_t = -lambda_pos d_t^2                        - lambda_torque |tau_t|^2     (the lesson's section 5.2)
     precise:  r_t = -lambda_pos (d_t^2 + PULL d_t)           - lambda_torque |tau_t|^2
 
-The square is flat near the goal (at 2 cm its slope is 0.04 per metre); the added distance pulls with the same slope at
-every distance, up to the last centimetre. Never terminates; the time limit is a truncation. The state of the goal
+The square is flat near the goal (at 2 cm its slope is 0.04 per metre); the added distance, which is the default, pulls
+with the same slope at every distance, up to the last centimetre. Never terminates; the time limit is a truncation.
 `success` is reported at every step; the last step's is the episode's.
 """
 
@@ -32,7 +32,7 @@ class ArmConfig:
     """Options of the arm."""
 
     reward: str = option(
-        "lesson", "squared distance, or one that pulls at the last centimetres too", choices=("lesson", "precise")
+        "precise", "squared distance, or one that pulls at the last centimetres too", choices=("lesson", "precise")
     )
     control: str = option("torque", "what an action commands", choices=("torque", "velocity"))
     gravity: bool = option(False, "the arm moves in the upright plane, under gravity")
@@ -66,6 +66,25 @@ class ArmConfig:
 
 
 TRAINING = {
+    "ppo": {
+        "num_envs": 128,
+        "num_steps": 50,
+        "total_steps": 6_000_000,
+        "log_interval": 100_000,
+        "eval_interval": 500_000,
+        "checkpoint_interval": 2_000_000,
+        "algo.epochs": 4,
+        "algo.minibatches": 8,
+        "algo.actor_lr": 0.004,
+        "algo.critic_lr": 0.008,
+        "algo.final_lr": 0.02,
+        "algo.gamma": 0.9,
+        "algo.lambda_": 0.85,
+        "algo.reward_scale": 10.0,
+        "algo.normalize_advantages": False,  # they fall with the distance, and so do the steps
+        "network.widths": [32, 32],
+        "network.activation": "elu",
+    },
     "td": {
         "num_envs": 64,
         "num_steps": 16,

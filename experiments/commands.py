@@ -19,10 +19,11 @@ from jaxpg.run.statistics import bootstrap_interval, interquartile_mean
 RESULTS = Path(__file__).parent / "results"
 
 
-def train(folder: Path, *arguments: str) -> float:
+def train(folder: Path, *arguments: str, environment: dict[str, str] | None = None) -> float:
     """Runs `python -m jaxpg.train` into `folder`; returns the seconds from start to end of the process."""
     began = time.monotonic()
-    subprocess.run([sys.executable, "-m", "jaxpg.train", *arguments, f"run_dir={folder}"], check=True)
+    command = [sys.executable, "-m", "jaxpg.train", *arguments, f"run_dir={folder}"]
+    subprocess.run(command, check=True, env=environment)
     return time.monotonic() - began
 
 

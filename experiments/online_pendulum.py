@@ -22,9 +22,10 @@ import numpy as np
 from commands import write_figure, write_json
 from matplotlib.figure import Figure
 
+from jaxpg.run.agents import agents_of
 from jaxpg.run.config import compose
 from jaxpg.run.figures import draw_curve
-from jaxpg.run.program import agent_keys, make_algorithm, make_env, plan
+from jaxpg.run.program import make_algorithm, make_env, plan
 from jaxpg.run.statistics import interquartile_mean
 from jaxpg.training import train_scan
 
@@ -40,8 +41,8 @@ def returns(*options: str) -> tuple[np.ndarray, np.ndarray]:
     """Steps `[K]` and mean return of the episodes that ended since the last point, `[S, K]`."""
     config = compose(["env=pendulum", "algo=online", f"num_seeds={NUM_SEEDS}", *SIZES, *options])
     algorithm, schedule = make_algorithm(config, make_env(config)), plan(config)
-    train = jax.vmap(lambda key: train_scan(algorithm, key, schedule.num_updates))
-    _, metrics = jax.jit(train)(agent_keys(config))
+    train = jax.vmap(lambda seed: train_scan(algorithm, jax.random.key(seed), schedule.num_updates))
+    _, metrics = jax.jit(train)(agents_of(config).seed)
     ends = np.linspace(0, schedule.num_updates, min(POINTS, schedule.num_updates) + 1).astype(int)
     total, episodes = (
         np.add.reduceat(np.asarray(metrics[name], float), ends[:-1], axis=1) for name in ("return_sum", "episodes")

@@ -6,13 +6,15 @@ For several numbers of environments and network widths, rollouts of 8 steps, in 
 several rounds each:
 
 - steps/s of the training as it is; with the physics taken out (the state stands still); with the networks taken out
-  (actions are noise, nothing is learned: rollouts only);
+  (actions are noise, nothing is learned: rollouts only); with all but the networks' matrix products taken out;
 - its share of the peak: multiplications and additions of the networks' matrix products, over the rate of one product of
   two 1,024 x 1,024 matrices in the same process. A sample passes the actor twice (to act, to learn) and the critic
-  twice (its own value, the next one's); each of the two that learn costs twice a pass more, backwards;
+  once, a rollout's ends twice more; each of the two that learn costs twice a pass more, backwards; beside it the share
+  that the products reach alone, which is the most that a training of these shapes can have;
 - memory that the program needs beside its arguments.
 
-Then 1, 8 and 64 agents at once: time of an update of all over that of one agent times their number.
+Then the programs of `python -m jaxpg.train` for 8 and 64 agents at once: their time over that of one agent times their
+number, with the agents in programs of their own, side by side on the cores, and with several in one program (vmap).
 
 Writes results/throughput.json and prints it as tables.
 """
@@ -29,14 +31,16 @@ from commands import write_json
 
 from jaxpg.rollout import rollout
 from jaxpg.run.config import Config, compose
-from jaxpg.run.program import make_algorithm, make_env
+from jaxpg.run.program import compile_program, make_algorithm, make_env, plan
 from jaxpg.training import initial_state, train_scan
 from jaxpg.vector_env import vectorize
 
 TASK = "pendulum"
 NUM_ENVS = (32, 256, 1024)
 WIDTHS = (32, 64, 128)
-SEEDS = (1, 8, 64)
+ALGORITHMS = ("ppo", "td")
+SEEDS = (8, 64)
+IN_ONE_PROGRAM = (1, 4, 8)
 NUM_STEPS = 8
 SAMPLES = 80_000  # of one measurement, of each agent
 ROUNDS = 7
@@ -57,15 +61,10 @@ class Standing:
         return state.replace(reward=state.reward + 0.0 * action[0])
 
 
-def training(config: Config, env: Any, num_seeds: int = 1) -> tuple[Callable, Any]:
-    """`(train, state)`, where `train(state)` makes the updates of one measurement; several agents are vmapped."""
-    algorithm, updates = make_algorithm(config, env), num_updates(config)
-    key = jax.random.key(0)
-    if num_seeds == 1:
-        return lambda state: train_scan(algorithm, key, updates, state), initial_state(algorithm, key)
-    keys = jax.random.split(key, num_seeds)
-    train = jax.vmap(lambda key, state: train_scan(algorithm, key, updates, state))
-    return lambda state: train(keys, state), jax.jit(jax.vmap(lambda key: initial_state(algorithm, key)))(keys)
+def training(config: Config, env: Any) -> tuple[Callable, Any]:
+    """`(train, state)`, where `train(state)` makes the updates of one measurement."""
+    algorithm, updates, key = make_algorithm(config, env), num_updates(config), jax.random.key(0)
+    return lambda state: train_scan(algorithm, key, updates, state), initial_state(algorithm, key)
 
 
 def rollouts(config: Config, env: Any) -> tuple[Callable, Any]:
@@ -84,6 +83,33 @@ def rollouts(config: Config, env: Any) -> tuple[Callable, Any]:
     return lambda state: jax.lax.scan(play, state, keys), vector.reset(jax.random.key(1))
 
 
+def products(config: Config, observation_size: int) -> tuple[Callable, Any]:
+    """As `training`, of the networks' matrix products only: of the same shapes, forwards and backwards."""
+    sizes = [observation_size, *config.network.widths, 1]
+    keys = jax.random.split(jax.random.key(0), len(sizes))
+    layers = [
+        jax.random.normal(key, pair) / pair[0] for key, *pair in zip(keys[1:], sizes[:-1], sizes[1:], strict=True)
+    ]
+    obs = jax.random.normal(keys[0], (NUM_STEPS, config.run.num_envs, observation_size))
+    rows = obs.reshape(-1, observation_size)
+
+    def network(layers, x):
+        for layer in layers:
+            x = x @ layer
+        return x
+
+    def learn(params):
+        return jnp.sum(network(params["actor"], rows) ** 2) + jnp.sum(network(params["critic"], rows) ** 2)
+
+    def update(params, _):
+        acting = jax.lax.map(lambda x: jnp.sum(network(params["actor"], x)), obs)
+        next_value = jnp.sum(network(params["critic"], rows[: 2 * config.run.num_envs] + 1e-6 * acting[0]))
+        return jax.tree.map(lambda w, g: w - 1e-9 * (g + next_value), params, jax.grad(learn)(params)), None
+
+    state = {"actor": layers, "critic": layers}
+    return lambda params: jax.lax.scan(update, params, length=num_updates(config)), state
+
+
 def num_updates(config: Config) -> int:
     return max(1, SAMPLES // (config.run.num_envs * NUM_STEPS))
 
@@ -94,22 +120,26 @@ def product() -> tuple[Callable, Any]:
     return lambda x: jax.lax.scan(lambda y, _: (y @ x, None), x, length=10), x
 
 
-def seconds(programs: dict[str, tuple[Callable, Any]]) -> tuple[dict[str, float], dict[str, int]]:
-    """The best time of each program, measured in turns, and the bytes that it needs beside its arguments."""
-    compiled = {name: (jax.jit(run).lower(state).compile(), state) for name, (run, state) in programs.items()}
+def seconds(programs: dict[str, tuple[Callable, Any]]) -> dict[str, float]:
+    """The best time of each program `(run, state)`, measured in turns."""
     best = dict.fromkeys(programs, float("inf"))
     for _ in range(ROUNDS + 1):  # the first one warms up
-        for name, (run, state) in compiled.items():
+        for name, (run, state) in programs.items():
             began = time.perf_counter()
             jax.block_until_ready(run(state))
             best[name] = min(best[name], time.perf_counter() - began)
-    return best, {name: run.memory_analysis().temp_size_in_bytes for name, (run, _) in compiled.items()}
+    return best
+
+
+def compiled(run: Callable, state: Any) -> tuple[Callable, Any]:
+    return jax.jit(run).lower(state).compile(), state
 
 
 def operations(observation_size: int, width: int) -> int:
     """Multiplications and additions of the networks for one sample, with one action."""
     one_pass = 2 * (observation_size * width + width * width + width)
-    return one_pass * (2 * 2 + 2 * 2)  # both networks: two passes each, and two of a pass's size backwards
+    forwards = 2 + 1 + 2 / NUM_STEPS
+    return round(one_pass * (forwards + 2 * 2))  # backwards, two of a pass's size for either network
 
 
 def sizes() -> list[dict[str, Any]]:
@@ -119,15 +149,15 @@ def sizes() -> list[dict[str, Any]]:
             config = configured(num_envs, width)
             env = make_env(config)
             samples = num_updates(config) * num_envs * NUM_STEPS
-            took, memory = seconds(
-                {
-                    "training": training(config, env),
-                    "no physics": training(config, Standing(env)),
-                    "no networks": rollouts(config, env),
-                    "product": product(),
-                }
-            )
-            peak = 10 * 2 * 1024**3 / took["product"]
+            programs = {
+                "training": compiled(*training(config, env)),
+                "no physics": compiled(*training(config, Standing(env))),
+                "no networks": compiled(*rollouts(config, env)),
+                "products alone": compiled(*products(config, env.observation_size)),
+                "product": compiled(*product()),
+            }
+            took, memory = seconds(programs), programs["training"][0].memory_analysis().temp_size_in_bytes
+            peak, work = 10 * 2 * 1024**3 / took["product"], samples * operations(env.observation_size, width)
             rows.append(
                 {"environments": num_envs, "width": width}
                 | {
@@ -135,11 +165,10 @@ def sizes() -> list[dict[str, Any]]:
                     for name in ("training", "no physics", "no networks")
                 }
                 | {
-                    "share of peak": round(
-                        operations(env.observation_size, width) * samples / took["training"] / peak, 3
-                    ),
+                    "share of peak": round(work / took["training"] / peak, 3),
+                    "products alone": round(work / took["products alone"] / peak, 3),
                     "peak, GFLOP/s": round(peak / 1e9, 1),
-                    "memory, MB": round(memory["training"] / 1e6, 1),
+                    "memory, MB": round(memory / 1e6, 1),
                 }
             )
             print(rows[-1], flush=True)
@@ -147,20 +176,30 @@ def sizes() -> list[dict[str, Any]]:
 
 
 def agents() -> list[dict[str, Any]]:
-    config = compose([f"env={TASK}", "algo=td"])
-    env = make_env(config)
-    took, _ = seconds({str(number): training(config, env, number) for number in SEEDS})
-    return [
-        {"agents": number, "time over that of one after the other": round(took[str(number)] / number / took["1"], 3)}
-        for number in SEEDS
-    ]
+    rows = []
+    for algo in ALGORITHMS:
+        alone = seconds({"alone": agents_at_once(algo, 1, 1)})["alone"]
+        for number in SEEDS:
+            programs = {str(size): agents_at_once(algo, number, size) for size in IN_ONE_PROGRAM}
+            took = seconds(programs)
+            shares = {f"{size} in a program": round(took[str(size)] / number / alone, 3) for size in IN_ONE_PROGRAM}
+            rows.append({"algorithm": algo, "agents": number, **shares})
+            print(rows[-1], flush=True)
+    return rows
+
+
+def agents_at_once(algo: str, number: int, size: int) -> tuple[Callable, Any]:
+    """The updates between two lines of metrics of this many agents, `size` of them in one program."""
+    config = compose([f"env={TASK}", f"algo={algo}", f"num_seeds={number}", f"vmap_seeds={size}"])
+    program = compile_program(config, make_env(config), plan(config).chunk)
+    return program.advance, program.init().train
 
 
 def table(rows: list[dict[str, Any]]) -> None:
     print("| " + " | ".join(rows[0]) + " |")
     print("|---" * len(rows[0]) + "|")
     for row in rows:
-        print("| " + " | ".join(f"{value:,}" for value in row.values()) + " |")
+        print("| " + " | ".join(value if isinstance(value, str) else f"{value:,}" for value in row.values()) + " |")
 
 
 def main() -> None:

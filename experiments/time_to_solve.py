@@ -13,6 +13,7 @@ Evaluations are off the clock.
     brax               PPO on this repository's MJX pendulum, with settings found by hand: brax ships none for it
     RLtools            SAC, the example of its Python package, with MKL; needs g++ and Python's headers
 
+jaxpg keeps what XLA compiles; its row "second time" is a process that finds it. The others keep nothing by themselves.
 Their dependencies conflict: each has its own virtual environment, made by what the second command prints; a contestant
 without one is left out. Training ends with the contestant's own number of steps or after its `budget` of seconds.
 All take turns: seed 0 of everyone, seed 1 of everyone, ...; then the plain command `python -m jaxpg.train` is run once
@@ -57,6 +58,7 @@ class Contestant:
       budget: seconds from the start of the process after which it stops, evaluations not counted.
       venv: its virtual environment and requirements file; None is the interpreter that runs this.
       options: of the script.
+      again: the process finds what an earlier one of the same kind has compiled; else its cache folder is empty.
     """
 
     name: str
@@ -64,10 +66,12 @@ class Contestant:
     budget: float
     venv: str | None = None
     options: tuple[str, ...] = ()
+    again: bool = False
 
 
 CONTESTANTS = [
     *(Contestant(f"jaxpg {name}", "own.py", 60, options=options) for name, options in JAXPG.items()),
+    Contestant("jaxpg PPO, second time", "own.py", 60, options=JAXPG["PPO"], again=True),
     Contestant("RLtools SAC", "rltools_sac.py", 60, "rltools"),
     Contestant("SB3 PPO", "sb3.py", 90, "sb3", ("algo=ppo",)),
     Contestant("SB3 A2C", "sb3.py", 120, "sb3", ("algo=a2c",)),
@@ -88,9 +92,12 @@ def install_command(venv: str, venvs: Path) -> str:
 
 def run(contestant: Contestant, python: Path, seed: int) -> list[dict[str, float]]:
     """One training from a cold process; returns its learning curve, empty where it failed."""
-    environment = {name: value for name, value in os.environ.items() if name != "JAX_COMPILATION_CACHE_DIR"}
     with tempfile.TemporaryDirectory() as folder:
+        environment = os.environ | {"XDG_CACHE_HOME": folder}
+        environment.pop("JAX_COMPILATION_CACHE_DIR", None)
         out = Path(folder) / "curve.json"
+        if contestant.again:
+            train(Path(folder) / "before", "env=pendulum", *contestant.options, environment=environment)
         options = [f"seed={seed}", f"budget={contestant.budget}", f"out={out}", *contestant.options]
         command = [python, PEERS / contestant.script, *options, f"started={time.time()}"]
         try:

@@ -14,15 +14,9 @@ import jax.numpy as jnp
 import optax
 
 from jaxpg import baselines, estimators, normalization
-from jaxpg.distributions import gaussian_kl, gaussian_sample
+from jaxpg.distributions import gaussian_sample
 from jaxpg.estimators import Estimate
-from jaxpg.losses import (
-    clipped_surrogate_loss,
-    clipped_value_loss,
-    entropy_loss,
-    policy_gradient_loss,
-    value_loss,
-)
+from jaxpg.learning import Batch, Reuse, actor_critic_loss, one_step, several_steps
 from jaxpg.networks import Networks
 from jaxpg.returns import discount_factors
 from jaxpg.rollout import PolicyFn, rollout
@@ -126,25 +120,6 @@ def reinforce(gamma: float, baseline: str, returns: str = "to_go", discounted: b
     return Method(lambda env, key: env.reset(key), collect, weight, estimate)
 
 
-class Reuse(NamedTuple):
-    """How often one rollout is learned from, and how far that may move the policy: PPO.
-
-    Attributes:
-      epochs: passes over the rollout, each in another order.
-      minibatches: gradient steps of a pass, each on its share of the environments; a divisor of their number.
-      clip: epsilon of `jaxpg.losses.clipped_surrogate_loss`; None does not clip.
-      value_clip: c of `jaxpg.losses.clipped_value_loss`; None does not clip.
-      max_kl: the rest of the rollout's gradient steps is left out once the policy that acted is further than this from
-        the one that it has become, as the mean over a minibatch; None takes all of them.
-    """
-
-    epochs: int
-    minibatches: int
-    clip: float | None = 0.2
-    value_clip: float | None = None
-    max_kl: float | None = None
-
-
 def actor_critic(
     env: VectorEnv,
     networks: Networks,
@@ -174,7 +149,7 @@ def actor_critic(
       `Algorithm(init, step)`; metrics are scalars, of which `return_sum` and `episodes` are to be summed over updates
       and the others averaged.
     """
-    prepare = batch_of(networks, method, reward_scale, normalize_advantages)
+    prepare = batch_of(networks, method, env.episode_length, reward_scale, normalize_advantages)
     loss = actor_critic_loss(networks, entropy_coef, reuse)
     learn = one_step(loss, optimizer) if reuse is None else several_steps(loss, optimizer, reuse)
 
@@ -207,41 +182,24 @@ def actor_critic(
     return Algorithm(init, step)
 
 
-class Batch(NamedTuple):
-    """A rollout as the losses see it, `[T, N, ...]`; constants, of the parameters that acted.
-
-    Attributes:
-      obs: normalized.
-      u: what the policy's Gaussian drew.
-      mean, log_std, log_prob: of the policy that acted.
-      value: V(s_t) of the critic at that time.
-      advantage, target, weight: as in `Estimate` and `Method`.
-    """
-
-    obs: jax.Array
-    u: jax.Array
-    mean: jax.Array
-    log_std: jax.Array
-    log_prob: jax.Array
-    value: jax.Array
-    advantage: jax.Array
-    target: jax.Array
-    weight: jax.Array
-
-
 def batch_of(
-    networks: Networks, method: Method, reward_scale: float, normalize_advantages: bool
+    networks: Networks, method: Method, episode_length: int, reward_scale: float, normalize_advantages: bool
 ) -> Callable[[PyTree, PyTree, Transition], Batch]:
     """`prepare(params, normalizer, transition) -> Batch`: the advantages of a rollout, and what they are made of.
 
     Args:
       networks, method, reward_scale, normalize_advantages: as in `actor_critic`.
+      episode_length: the time limit.
     """
 
     def prepare(params, normalizer, transition):
         obs = normalization.normalize(normalizer, transition.obs)
-        next_obs = normalization.normalize(normalizer, transition.next_obs)
-        value, next_value = (networks.value(params["critic"], x) for x in (obs, next_obs))
+        value = networks.value(params["critic"], obs)
+
+        def value_fn(x):
+            return networks.value(params["critic"], normalization.normalize(normalizer, x))
+
+        next_value = next_values(value_fn, value, transition, episode_length)
         weight = method.weight(transition)
         scaled = transition._replace(reward=reward_scale * transition.reward)
         mean, log_std = networks.policy(params["actor"], obs)
@@ -256,110 +214,26 @@ def batch_of(
     return prepare
 
 
-def actor_critic_loss(
-    networks: Networks, entropy_coef: float, reuse: Reuse | None = None
-) -> Callable[[PyTree, Batch], tuple[jax.Array, Metrics]]:
-    """`loss(params, batch) -> (L, metrics)`: of actor and critic together.
+def next_values(
+    value_fn: Callable[[jax.Array], jax.Array], value: jax.Array, transition: Transition, episode_length: int
+) -> jax.Array:
+    """V(s_{t+1}) of the true next observations, `[T, N]`; any number where the episode terminated.
 
-        L(theta, w) = L_pi(theta) + 1/2 mean((V_w(s_t) - target_t)^2) - entropy_coef mean(H_t)
+    Where an episode goes on it is the value of the next row. A time limit is reached at most once in T <=
+    episode_length steps: of each environment two more values are needed, at its time limit and after the last step.
 
     Args:
-      networks, entropy_coef: as in `actor_critic`.
-      reuse: None for L_pi = -mean(log pi_theta(a_t | s_t) A_t); else the clipped surrogate.
+      value_fn: `value_fn(obs) -> V`.
+      value: V(s_t), `[T, N]`.
+      transition: of the rollout.
+      episode_length: the time limit; the values of all next observations are computed where the rollout is longer.
     """
-
-    def policy_loss(batch, mean, log_std):
-        log_prob = networks.distribution.log_prob(batch.u, mean, log_std)
-        if reuse is None:
-            return policy_gradient_loss(log_prob, batch.advantage, batch.weight), {}
-        moved = {"kl": jnp.mean(gaussian_kl(batch.mean, batch.log_std, mean, log_std))}
-        loss = clipped_surrogate_loss(log_prob, batch.log_prob, batch.advantage, reuse.clip, batch.weight)
-        return loss, jax.lax.stop_gradient(moved)
-
-    def critic_loss(batch, value):
-        if reuse is None or reuse.value_clip is None:
-            return value_loss(value, batch.target, batch.weight)
-        return clipped_value_loss(value, batch.value, batch.target, reuse.value_clip, batch.weight)
-
-    def loss(params, batch):
-        value = networks.value(params["critic"], batch.obs)
-        mean, log_std = networks.policy(params["actor"], batch.obs)
-        of_policy, moved = policy_loss(batch, mean, log_std)
-        entropy = networks.distribution.entropy(batch.u, mean, log_std)
-        losses = {
-            "policy_loss": of_policy,
-            "value_loss": critic_loss(batch, value),
-            "entropy": -entropy_loss(entropy, batch.weight),
-        }
-        total = losses["policy_loss"] + losses["value_loss"] - entropy_coef * losses["entropy"]
-        return total, losses | moved | {"sigma": jnp.mean(jnp.exp(log_std)), "value": jnp.mean(value)}
-
-    return loss
-
-
-# learn(params, opt_state, batch, key) -> (params, opt_state, metrics)
-Learn = Callable[[PyTree, PyTree, Batch, jax.Array], tuple[PyTree, PyTree, Metrics]]
-
-
-def one_step(loss: Callable, optimizer: optax.GradientTransformation) -> Learn:
-    """One gradient step on the whole batch."""
-
-    def learn(params, opt_state, batch, key=None):
-        gradients, metrics = jax.grad(loss, has_aux=True)(params, batch)
-        updates, opt_state = optimizer.update(gradients, opt_state, params)
-        metrics = metrics | {"gradient_norm": optax.tree.norm(gradients)}
-        return optax.apply_updates(params, updates), opt_state, metrics
-
-    return learn
-
-
-def several_steps(loss: Callable, optimizer: optax.GradientTransformation, reuse: Reuse) -> Learn:
-    """`reuse.epochs` passes over the batch in `reuse.minibatches` parts; metrics are means over the steps taken."""
-    once = one_step(loss, optimizer)
-
-    def take(carry, part):
-        params, opt_state, near = carry
-        params, opt_state, metrics = once(params, opt_state, part)
-        return (params, opt_state, near), metrics | {"gradient_steps": jnp.ones(())}
-
-    def take_while_near(carry, part):
-        def attempt():
-            (params, opt_state, _), metrics = take(carry, part)
-            near = metrics["kl"] <= reuse.max_kl  # of the parameters before the step
-            taken = jax.tree.map(lambda new, old: jnp.where(near, new, old), (params, opt_state), carry[:2])
-            return (*taken, near), jax.tree.map(lambda x: near * x, metrics)
-
-        nothing = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), jax.eval_shape(attempt)[1])
-        return jax.lax.cond(carry[2], attempt, lambda: (carry, nothing))
-
-    step = take if reuse.max_kl is None else take_while_near
-
-    def learn(params, opt_state, batch, key):
-        def epoch(carry, key):
-            return jax.lax.scan(step, carry, shuffled_parts(batch, key, reuse.minibatches))
-
-        carry = params, opt_state, jnp.array(True)
-        (params, opt_state, _), metrics = jax.lax.scan(epoch, carry, jax.random.split(key, reuse.epochs))
-        steps = jnp.sum(metrics["gradient_steps"])
-        metrics = {name: jnp.sum(x) / jnp.maximum(steps, 1) for name, x in metrics.items()}
-        return params, opt_state, metrics | {"gradient_steps": steps}
-
-    return learn
-
-
-def shuffled_parts(batch: PyTree, key: jax.Array, number: int) -> PyTree:
-    """The environments of a batch `[T, N, ...]` in `number` parts `[number, T, N / number, ...]`, all steps of each.
-
-    Neighbours stay neighbours: the parts begin at a random environment, which costs a copy and not a gather.
-    """
-    num_envs = batch.advantage.shape[1]
-    shift = jax.random.randint(key, (), 0, num_envs)
-
-    def parts(x):
-        x = jnp.roll(x, shift, axis=1)
-        return jnp.moveaxis(x.reshape(len(x), number, num_envs // number, *x.shape[2:]), 1, 0)
-
-    return jax.tree.map(parts, batch)
+    if len(value) > episode_length:
+        return value_fn(transition.next_obs)
+    when = jnp.argmax(transition.truncated, axis=0)
+    at_limit = jnp.take_along_axis(transition.next_obs, when[None, :, None], axis=0)[0]
+    of_limit, of_last = value_fn(jnp.stack([at_limit, transition.next_obs[-1]]))
+    return jnp.where(transition.truncated > 0, of_limit, jnp.concatenate([value[1:], of_last[None]]))
 
 
 def sampling_policy(networks: Networks, params: PyTree, normalizer: PyTree) -> PolicyFn:

@@ -10,12 +10,13 @@ from envs.options import build
 from jaxpg.run import config, help
 from jaxpg.run.errors import UserError, run_command
 from jaxpg.run.schema import EvaluateOptions
+from jaxpg.run.sweep import described
 
 
 def main(arguments: Sequence[str]) -> int:
     """The evaluation command; returns its exit status."""
     if {"--help", "-h"} & set(arguments):
-        print(help.evaluate_help())
+        print(help.run_help("evaluate", EvaluateOptions))
         return 0
     from jaxpg.run import episodes, policies
     from jaxpg.run.cache import compilation_cache
@@ -31,7 +32,8 @@ def main(arguments: Sequence[str]) -> int:
         returns, metrics = play(stored, options.episodes, options.seed)
     mean, stderr = returns.mean(), returns.std(ddof=1) / math.sqrt(len(returns))
     saved = f"{options.checkpoint} policy (saved after {stored.update:,} updates)"
-    print(f"{stored.config.choices['env']}, seed {stored.seed}, {saved}, {options.backend}")
+    agent = f"seed {stored.config.run.seed} {described(stored.setting)}".strip()
+    print(f"{stored.config.choices['env']}, {agent}, {saved}, {options.backend}")
     print(f"return   {mean:.2f} +- {stderr:.2f} (mean and standard error, {len(returns)} episodes)")
     for metric, values in metrics.items():
         print(

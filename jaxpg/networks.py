@@ -122,16 +122,22 @@ def mlp_networks(
     action_size: int,
     widths: Sequence[int] = (64, 64),
     activation: str = "tanh",
+    features: str = "identity",
+    order: int = 1,
     initial_std: float = 1.0,
     sigma: str = "learned",
     distribution: Distribution = SQUASHED_GAUSSIAN,
 ) -> Networks:
     """Separate MLPs for the mean of the policy and for the value.
 
+        mu(s) = f(phi(s)),    V(s) = g(phi(s))
+
     Args:
       observation_size, action_size: of the environment.
       widths: hidden units by layer, the same for actor and critic.
       activation: a name in `ACTIVATIONS`.
+      features, order: phi, a name in `jaxpg.features.FEATURES` and its order. With the products of two observations an
+        energy, say, is linear in what the first layer sees.
       initial_std: sigma of the Gaussian over u; positive.
       sigma: a name in `SIGMAS`: as it is, a parameter, or the output of an MLP of its own. "scheduled" is a parameter
         like "learned"; that it follows a schedule is the optimizer's doing.
@@ -146,7 +152,7 @@ def mlp_networks(
     activation = ACTIVATIONS[activation]
     actor = GaussianActor(tuple(widths), action_size, activation, 0.01, initial_std, sigma)
     critic = MLP(tuple(widths), 1, output_gain=1.0, activation=activation)
-    return _networks(actor, critic, lambda obs: obs, observation_size, distribution)
+    return _networks(actor, critic, lambda obs: FEATURES[features](obs, order), observation_size, distribution)
 
 
 def linear_networks(

@@ -15,8 +15,11 @@ def main(arguments: Sequence[str]) -> int:
         return 0
     from jaxpg.run import session
 
-    if any(argument.startswith("resume=") for argument in arguments):
-        return session.resume(config.parse(arguments))
+    given = config.parse(arguments)
+    if given.get("resume") == "auto":
+        return session.begin_or_resume(config.compose([text for text in arguments if text != "resume=auto"]))
+    if "resume" in given:
+        return session.resume(given)
     return session.begin(config.compose(arguments))
 
 

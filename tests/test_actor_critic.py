@@ -13,19 +13,16 @@ from jaxpg import normalization
 from jaxpg.actor_critic import (
     BASELINES,
     Method,
-    Reuse,
     actor_critic,
-    actor_critic_loss,
     batch_of,
     deterministic_policy,
     reinforce,
     sampling_policy,
-    several_steps,
-    shuffled_parts,
     td,
 )
 from jaxpg.estimators import td_lambda
 from jaxpg.evaluation import evaluate
+from jaxpg.learning import Reuse
 from jaxpg.networks import mlp_networks
 from jaxpg.training import initial_state, train_scan
 from jaxpg.vector_env import vectorize
@@ -211,85 +208,23 @@ def test_one_unclipped_step_of_ppo_is_td():
     assert max(abs(a - b).max() for a, b in zip(*map(jax.tree.leaves, (left.params, other.params)), strict=True)) > 1e-3
 
 
-def a_batch(networks, params, num_envs=6, method=None):
-    """The first rollout on `Counter`, ready for the losses."""
-    method = method or td(0.9, 0.95, 5)
-    vector, statistics = vectorize(Counter(), num_envs, 10), normalization.init(2)
-    policy_fn = sampling_policy(networks, params, statistics)
-    _, steps = method.collect(vector, policy_fn, vector.reset(new_key()), jax.random.key(1))
-    return batch_of(networks, method, 1.0, True)(params, statistics, steps)
-
-
-def test_advantages_are_of_the_values_of_both_normalized_observations():
-    """TD(0): A = 2 r + gamma V(s') - V(s), with the true next observation at the time limit."""
+@pytest.mark.parametrize("limit", [3, 5, 7])
+def test_advantages_are_of_the_values_of_both_normalized_observations(limit):
+    """A = 2 r + gamma V(s') - V(s) of TD(0), with the true next observation at time limits; rollouts short and long."""
     networks, _ = make(Counter(), td(0.9, 0.0, 5))
-    params, vector = networks.init(new_key()), vectorize(Counter(), 6, 3)
+    params, vector = networks.init(new_key()), vectorize(Counter(life=4), 12, limit)
     statistics = normalization.update(normalization.init(2), jnp.array([[1.0, 2.0], [4.0, -3.0]]))
     method, policy_fn = td(0.9, 0.0, 5), sampling_policy(networks, params, statistics)
-    _, steps = method.collect(vector, policy_fn, vector.reset(new_key()), jax.random.key(1))
-    batch = batch_of(networks, method, 2.0, False)(params, statistics, steps)
+    _, steps = method.collect(vector, policy_fn, method.start(vector, new_key()), jax.random.key(1))
+    batch = batch_of(networks, method, limit, 2.0, False)(params, statistics, steps)
     value, next_value = (
         networks.value(params["critic"], normalization.normalize(statistics, x)) for x in (steps.obs, steps.next_obs)
     )
     expected = 2 * steps.reward + 0.9 * (1 - steps.terminated) * next_value - value
     np.testing.assert_allclose(batch.advantage, expected, rtol=1e-5, atol=1e-5)
     np.testing.assert_allclose(batch.target, expected + value, rtol=1e-5, atol=1e-5)
-    assert steps.truncated.sum() > 0
-
-
-@pytest.mark.parametrize("minibatches", [1, 2, 3])
-def test_parts_hold_every_environment_once(minibatches):
-    networks, _ = make(Counter(), td(0.9, 0.95, 5))
-    batch = a_batch(networks, networks.init(new_key()))
-    number = jnp.broadcast_to(jnp.arange(6.0), (5, 6))
-    seen = set()
-    for seed in range(8):
-        parts = shuffled_parts(batch._replace(advantage=number, u=number[..., None]), new_key(seed), minibatches)
-        assert parts.advantage.shape == (minibatches, 5, 6 // minibatches)
-        np.testing.assert_array_equal(parts.advantage, parts.u[..., 0])  # all fields in the same order
-        np.testing.assert_array_equal(
-            parts.advantage, parts.advantage[:, :1] + jnp.zeros((5, 1))
-        )  # steps stay together
-        np.testing.assert_array_equal(np.sort(parts.advantage[:, 0].ravel()), np.arange(6))
-        seen.add(tuple(parts.advantage[:, 0].ravel().tolist()))
-    assert len(seen) > 1  # another order in another epoch
-
-
-def steps_taken(reuse):
-    """Parameters after the reuse of one rollout, plain gradient steps of 0.5, and the metrics; the same by a loop."""
-    networks, _ = make(Counter(), td(0.9, 0.95, 5))
-    params, optimizer = networks.init(new_key()), optax.sgd(0.5)
-    batch, loss = a_batch(networks, params), actor_critic_loss(networks, 0.01, reuse)
-    found, _, metrics = jax.jit(several_steps(loss, optimizer, reuse))(
-        params, optimizer.init(params), batch, new_key(3)
-    )
-    by_loop, divergence = params, []
-    for key in jax.random.split(new_key(3), reuse.epochs):
-        parts = shuffled_parts(batch, key, reuse.minibatches)
-        for i in range(reuse.minibatches):
-            slope, terms = jax.grad(loss, has_aux=True)(by_loop, jax.tree.map(operator.itemgetter(i), parts))
-            divergence.append(float(terms["kl"]))
-            if max(divergence) <= (reuse.max_kl or np.inf):
-                by_loop = jax.tree.map(lambda x, g: x - 0.5 * g, by_loop, slope)
-    return found, by_loop, metrics, divergence
-
-
-@pytest.mark.parametrize("clip", [0.05, None])
-def test_several_steps_are_a_loop_over_epochs_and_parts(clip):
-    found, by_loop, metrics, divergence = steps_taken(Reuse(epochs=3, minibatches=2, clip=clip, value_clip=0.2))
-    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-4, atol=1e-5), found, by_loop)
-    assert metrics["gradient_steps"] == 6
-    np.testing.assert_allclose(metrics["kl"], np.mean(divergence), rtol=1e-3)
-
-
-def test_steps_end_where_the_policy_has_moved_too_far():
-    *_, divergence = steps_taken(Reuse(epochs=4, minibatches=2, clip=None))
-    assert 0 < divergence[1] < divergence[3] < divergence[-1]
-    limit = (divergence[3] + max(divergence[:3])) / 2
-    found, by_loop, metrics, _ = steps_taken(Reuse(epochs=4, minibatches=2, clip=None, max_kl=limit))
-    assert metrics["gradient_steps"] == 3
-    np.testing.assert_allclose(metrics["kl"], np.mean(divergence[:3]), rtol=1e-3)
-    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-4, atol=1e-5), found, by_loop)
+    assert steps.truncated[:-1].sum() > 0
+    assert (steps.terminated.sum() > 0) == (limit > 3)
 
 
 def test_finds_the_best_action_from_few_rollouts():

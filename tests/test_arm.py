@@ -45,7 +45,7 @@ def test_goals_are_uniform_over_the_ring():
 
 def test_lesson_reward():
     """r = -lambda_pos |x_ee - x_goal|^2 - lambda_torque |tau|^2, of the state before the step."""
-    env = envs.make("arm", lambda_pos=2.0, lambda_torque=0.01)
+    env = envs.make("arm", reward="lesson", lambda_pos=2.0, lambda_torque=0.01)
     before = jax.jit(env.reset)(jax.random.key(0))
     action = jnp.array([0.5, -1.0])
     error = np.asarray(end_effector(before.pipeline_state.qpos, LENGTHS) - before.pipeline_state.goal, float)

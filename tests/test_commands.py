@@ -2,6 +2,7 @@
 
 import json
 import re
+import shutil
 import signal
 import subprocess
 import sys
@@ -62,7 +63,7 @@ def test_a_run_makes_no_noise(uninterrupted):
     assert result.stderr == ""
     assert not re.search("warp|warning|absl|deprecat", result.stdout, re.IGNORECASE)
     assert result.stdout.startswith(
-        "td on pendulum, seed 0: 4 environments x 4 steps x 256 updates = 4,096 steps, into"
+        "ppo on pendulum, seed 0: 4 environments x 4 steps x 256 updates = 4,096 steps, into"
     )
     assert "compiling" in result.stdout
 
@@ -105,11 +106,18 @@ def test_resume_with_more_steps(command, tmp_path):
     assert [line["steps"] for line in metrics(folder)] == list(range(64, 513, 64))
 
 
-@pytest.mark.parametrize(("agents", "enough"), [("one", np.max), ("all", np.min)])
-def test_a_run_ends_where_the_return_is_reached(command, tmp_path, agents, enough):
+@pytest.mark.parametrize(
+    ("agents", "enough", "two"),
+    [
+        ("one", np.max, "num_seeds=2"),
+        ("all", np.min, "num_seeds=2"),
+        ("one", np.max, "sweep.algo.actor_lr=[0.001,0.02]"),
+    ],
+)
+def test_a_run_ends_where_the_return_is_reached(command, tmp_path, agents, enough, two):
     """By the best or the worst of two agents; the checkpoint is there, and a higher return goes on."""
     folder = tmp_path / "run"
-    sizes = ("num_seeds=2", "log_interval=1600", "eval_interval=1600", "eval_episodes=2")
+    sizes = (two, "log_interval=1600", "eval_interval=1600", "eval_episodes=2")
     quadratic = ("env=quadratic", "algo=reinforce", *sizes, f"stop_agents={agents}", "stop_return=-2")
     result = command("train", *quadratic, f"run_dir={folder}")
     assert result.returncode == 0, result.stderr
@@ -169,6 +177,63 @@ def test_several_seeds_of_the_arm(command, tmp_path):
     assert answer["success"] is not None
 
 
+SWEEP = ("sweep.algo.gamma=[0.5,0.9]", "sweep.algo.actor_lr=[0.001,0.01,1e38]")
+
+
+@pytest.fixture(scope="module")
+def swept(command, tmp_path_factory):
+    """Six settings, two of which diverge, with two seeds."""
+    folder = tmp_path_factory.mktemp("runs") / "swept"
+    sizes = ("env=quadratic", "algo=td", "network=linear", "num_seeds=2", "total_steps=768", "env.episode_length=8")
+    result = command("train", *sizes, *TINY, *SWEEP, f"run_dir={folder}")
+    assert result.returncode == 0, result.stderr
+    assert result.stderr == ""
+    return folder, result.stdout
+
+
+def test_a_sweep_trains_every_setting_with_every_seed(swept):
+    """And says at the end which is the best, by the interquartile mean of the seeds."""
+    folder, text = swept
+    assert text.startswith("td on quadratic, 6 settings x seeds 0 to 1: ")
+    assert len(list((folder / "checkpoints").iterdir())) == 3
+    returns = np.array(metrics(folder)[-1]["eval_return"], float).reshape(6, 2)
+    assert np.isnan(returns[[2, 5]]).all(), "the settings change in the order of the command line, the last one fastest"
+    rows = re.findall(r"^algo\.gamma=(\S+) algo\.actor_lr=(\S+) +(\S+)(?: \[(\S+), (\S+)\])?$", text, re.MULTILINE)
+    means = {(gamma, lr): mean for gamma, lr, mean, _, _ in rows}
+    expected = [f"{mean:.1f}" for mean in returns.mean(axis=1)]
+    settings = [(gamma, lr) for gamma in ("0.5", "0.9") for lr in ("0.001", "0.01", "1e+38")]
+    assert [means[setting] for setting in settings] == [mean.replace("nan", "n/a") for mean in expected]
+    finite = [float(mean) for *_, mean, low, _ in rows if low]
+    assert finite == sorted(finite, reverse=True)
+    assert "inf" not in text
+    assert [lr for _, lr, *_ in rows[4:]] == ["1e+38", "1e+38"]
+
+
+def test_agents_of_a_sweep_are_evaluated_and_inspected_by_their_settings(swept, command):
+    folder, text = swept
+    first = text[text.index("[95 % interval]:") :].splitlines()[1]
+    assert f"best setting {re.sub(' {2,}', ': ', first)}" in command("inspect", f"run={folder}").stdout
+    result = command("evaluate", f"run={folder}", "episodes=2", "agent=7")
+    assert "quadratic, seed 1 algo.gamma=0.9 algo.actor_lr=0.001, best policy" in result.stdout
+    assert "the run has agents 0 to 11" in command("evaluate", f"run={folder}", "agent=12").stderr
+
+
+def test_a_sweep_resumed_is_the_sweep_never_stopped(swept, command, tmp_path):
+    """State, best policies and metrics to the bit; the sweep itself may not change."""
+    whole, _ = swept
+    folder = tmp_path / "stopped"
+    shutil.copytree(whole, folder)
+    shutil.rmtree(folder / "checkpoints" / "48")
+    result = command("train", f"resume={folder}", "sweep.algo.gamma=[0.5,0.8]")
+    assert result.returncode == 2
+    assert "has sweep.algo.gamma=[0.5, 0.9], and on resume only" in result.stderr
+    result = command("train", f"resume={folder}", *SWEEP)
+    assert result.returncode == 0, result.stderr
+    assert "resuming" in result.stdout
+    assert metrics(folder) == metrics(whole)
+    assert digests(folder) == digests(whole)
+
+
 # With mjx, brax's default here, it takes two minutes to compile.
 @pytest.mark.parametrize("backend", ["spring", pytest.param("mjx", marks=pytest.mark.study)])
 def test_brax_environments_train(command, tmp_path, backend):
@@ -189,18 +254,24 @@ def test_help_lists_every_option(command):
         "network.widths=[64,64]",
         "total_steps=",
         "none or mean or time_mean or leave_one_out or optimal or value",
+        "sweep.NAME=[VALUE,VALUE,...]",
     ):
         assert text in result.stdout
     assert "run=" in command("evaluate", "--help").stdout
 
 
 def test_several_mistakes_are_reported_at_once_with_status_2(command, tmp_path):
-    result = command("train", "algo.gamma=2", "seed=-1", "num_envs=2.5", f"run_dir={tmp_path / 'run'}")
+    swept = ("sweep.algo.lambda_=[0,2,3]", "sweep.algo.gama=[1]", "sweep.num_steps=[4]")
+    result = command("train", "algo.gamma=2", "seed=-1", "num_envs=2.5", *swept, f"run_dir={tmp_path / 'run'}")
     assert result.returncode == 2
     assert result.stdout == ""
     assert [line.split(":")[1].strip() for line in result.stderr.splitlines()] == [
         "algo.gamma=2",
         "seed=-1",
         "num_envs=2.5",
+        "sweep.algo.lambda_=2",
+        "sweep.algo.lambda_=3",
+        "unknown option 'sweep.algo.gama'",
+        "sweep.num_steps",
     ]
     assert not (tmp_path / "run").exists()

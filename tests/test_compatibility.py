@@ -6,8 +6,9 @@ import pytest
 from wrong_sums import wrong_sums
 
 from jaxpg.compatibility import WRONG_SUMS, check_jaxlib
+from jaxpg.run.agents import agents_of
 from jaxpg.run.config import compose
-from jaxpg.run.program import agent_keys, make_algorithm, make_env
+from jaxpg.run.program import make_algorithm, make_env
 from jaxpg.training import train_scan
 
 
@@ -30,7 +31,7 @@ def test_the_training_program_makes_no_lapack_call(environment):
     config = compose([f"env={environment}", *sizes])
     env = make_env(config)
     algorithm = make_algorithm(config, env)
-    train = jax.jit(jax.vmap(lambda key: train_scan(algorithm, key, 2)))
+    train = jax.jit(jax.vmap(lambda seed: train_scan(algorithm, jax.random.key(seed), 2)))
     with jax.debug_key_reuse(False):  # see test_vmapped_seeds_are_single_seeds
-        compiled = train.lower(agent_keys(config)).compile().as_text()
+        compiled = train.lower(agents_of(config).seed).compile().as_text()
     assert 'custom_call_target="lapack' not in compiled

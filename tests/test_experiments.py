@@ -10,6 +10,8 @@ import jax
 import numpy as np
 import pytest
 
+from jaxpg.run.config import compose
+
 EXPERIMENTS = Path(__file__).parent.parent / "experiments"
 PEERS = EXPERIMENTS / "peers"
 SCRIPTS = [script.stem for script in EXPERIMENTS.glob("*.py")]
@@ -32,7 +34,6 @@ def experiments(monkeypatch, command_environment, tmp_path):
 
     monkeypatch.setattr(commands, "train", tiny)
     monkeypatch.setattr(commands, "RESULTS", tmp_path)
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))  # default_runs has one of its own, which ends with it
     yield tmp_path
     for name in SCRIPTS:
         sys.modules.pop(name, None)
@@ -68,17 +69,20 @@ def test_reinforce_and_td(experiments, monkeypatch):
 def test_throughput(experiments, monkeypatch):
     import throughput
 
-    sizes = {"NUM_ENVS": (16,), "WIDTHS": (32,), "SEEDS": (1, 2), "SAMPLES": 2048, "ROUNDS": 1}
+    sizes = {"NUM_ENVS": (16,), "WIDTHS": (32,), "SAMPLES": 2048, "ROUNDS": 1}
+    sizes |= {"ALGORITHMS": ("td",), "SEEDS": (2,), "IN_ONE_PROGRAM": (1, 2)}
     for name, value in {"TASK": "quadratic", **sizes}.items():
         monkeypatch.setattr(throughput, name, value)
     with jax.debug_key_reuse(False):  # see test_vmapped_seeds_are_single_seeds
         throughput.main()
     result = json.loads((experiments / "throughput.json").read_text())
-    assert throughput.operations(3, 4) == 8 * 2 * (3 * 4 + 4 * 4 + 4)
+    assert throughput.operations(3, 4) == 7.25 * 2 * (3 * 4 + 4 * 4 + 4)
     (row,) = result["sizes"]
     of_peak = throughput.operations(1, 32) * row["training, steps/s"] / (1e9 * row["peak, GFLOP/s"])
     assert 0 < row["share of peak"] == pytest.approx(of_peak, abs=2e-3)
-    assert [row["agents"] for row in result["agents"]] == [1, 2]
+    assert row["products alone"] > row["share of peak"]
+    (row,) = result["agents"]
+    assert all(0 < row[f"{size} in a program"] < 10 for size in (1, 2))
 
 
 def test_sigma_choices(experiments, monkeypatch):
@@ -92,6 +96,23 @@ def test_sigma_choices(experiments, monkeypatch):
     assert summary["state"]["return"]["seeds"] == 2
     assert summary["state"]["sigma"]["interquartile_mean"]
     assert (experiments / "sigma_choices.png").read_bytes().startswith(b"\x89PNG")
+
+
+def test_sweep(experiments, monkeypatch, capsys):
+    """A draw is the training that has its values as options."""
+    import sweep
+
+    monkeypatch.setattr(sweep, "prepare", lambda config: None)  # it is too late in this process
+    sizes = ["env=quadratic", "algo=td", "num_envs=4", "total_steps=640", "eval_episodes=8"]
+    sweep.main(["--draws", "3", "--seeds", "2", *sizes])
+    assert "3 draws, 2 seeds of each" in capsys.readouterr().out
+    returns = [row["return"] for row in json.loads((experiments / "sweep_quadratic_td.json").read_text())["draws"]]
+    assert returns == sorted(returns, reverse=True)
+    assert len(set(returns)) == 3
+    drawn = sweep.results(compose(sizes), [{"algo.actor_lr": 0.01}, {"algo.actor_lr": 0.1}], 2)["return"]
+    given = sweep.results(compose([*sizes, "algo.actor_lr=0.1"]), [{}], 2)["return"]
+    np.testing.assert_allclose(drawn[1], given[0], rtol=1e-4)
+    assert abs(drawn[0] - drawn[1]) > 1e-3 * abs(drawn[1])
 
 
 def test_lesson_toy(experiments, monkeypatch):

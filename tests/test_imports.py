@@ -24,8 +24,8 @@ LEVELS = [
         "compatibility",
     },
     {"networks", "vector_env"},
-    {"rollout", "actor_critic", "online", "training", "evaluation"},
-    {"run", "train", "evaluate"},
+    {"rollout", "learning", "actor_critic", "online", "training", "evaluation"},
+    {"run", "train", "evaluate", "inspect"},
 ]
 FOREIGN = {0: {"jax"}, 1: {"jax", "flax"}, 2: {"jax", "optax"}}
 

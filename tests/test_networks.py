@@ -103,6 +103,20 @@ def test_linear_networks_are_linear():
         )
 
 
+def test_mlps_see_the_features():
+    """An MLP of features is the MLP of identity, of as many observations, where these are the features."""
+    phi = polynomial(jnp.asarray(X, jnp.float32), 2)
+    of_features = mlp_networks(2, 1, (8,), features="polynomial", order=2)
+    plain = mlp_networks(phi.shape[-1], 1, (8,))
+    params = plain.init(jax.random.key(0))
+    assert jax.tree.map(jnp.shape, of_features.init(jax.random.key(1))) == jax.tree.map(jnp.shape, params)
+    obs = jnp.asarray(X, jnp.float32)
+    np.testing.assert_array_equal(of_features.value(params["critic"], obs), plain.value(params["critic"], phi))
+    mean, _ = of_features.policy(params["actor"], obs)
+    np.testing.assert_array_equal(mean, plain.policy(params["actor"], phi)[0])
+    assert (mean != plain.policy(params["actor"], phi**2)[0]).any()
+
+
 def test_actions_of_both_distributions():
     u = jnp.array([-3.0, 0.2, 2.0])
     np.testing.assert_array_equal(GAUSSIAN.action(u), u)

@@ -153,7 +153,7 @@ def test_wrong_variants_are_seen(name):
 
 
 def test_seeds_and_chunks():
-    """vmapped seeds are single seeds, and training in pieces is training in one piece."""
+    """vmapped seeds are single seeds, and training in pieces is training in one; to rounding, as programs differ."""
     env = LinearQuadratic(chain(QuadraticConfig(state_size=2)))
     algorithm = online_actor_critic(vectorize(env, 2, 20), mlp_networks(2, 2, (8,)), num_steps=30, **OPTIONS)
     train = jax.jit(lambda key: train_scan(algorithm, key, 6))
@@ -169,4 +169,4 @@ def test_seeds_and_chunks():
     part, _ = jax.jit(lambda key: train_scan(algorithm, key, 2))(jax.random.key(3))
     rest, _ = jax.jit(lambda key, state: train_scan(algorithm, key, 4, state))(jax.random.key(3), part)
     whole, _ = train(jax.random.key(3))
-    jax.tree.map(np.testing.assert_array_equal, rest.params, whole.params)
+    jax.tree.map(lambda x, y: np.testing.assert_allclose(x, y, rtol=1e-5, atol=1e-7), rest.params, whole.params)

@@ -6,13 +6,42 @@ import jax
 import numpy as np
 import pytest
 
-from jaxpg.actor_critic import Reuse
-from jaxpg.run.config import compose
-from jaxpg.run.program import make_algorithm, make_env, make_reuse, plan
+import envs
+from jaxpg.learning import Reuse
+from jaxpg.run.config import compose, flatten
+from jaxpg.run.program import compile_program, make_algorithm, make_env, make_reuse, plan
+from jaxpg.run.state import current_policy
 from jaxpg.training import train_scan
 
 SIZES = ("env=quadratic", "network=linear", "num_envs=4", "num_steps=5", "total_steps=400", "env.episode_length=8")
 SCHEDULED = ("network.sigma_is=scheduled", "network.sigma=0.8", "network.final_sigma=0.05")
+
+
+@pytest.mark.parametrize("name", envs.REGISTRY)
+def test_the_algorithm_is_the_first_that_the_environment_has_tuned(name):
+    """With its values; those of an algorithm that was chosen are that one's."""
+    tuned = envs.find(name).training
+    assert compose([f"env={name}"]) == compose([f"env={name}", f"algo={next(iter(tuned))}"])
+    for algo, values in tuned.items():
+        found = flatten(compose([f"env={name}", f"algo={algo}"]))
+        assert found.items() >= {option: value for option, value in values.items() if option != "network"}.items()
+
+
+def test_features_tuned_for_one_network_say_nothing_of_another():
+    """Those of a linear network would be thousands of inputs of an MLP; the policy's options are any network's."""
+    tuned = envs.find("quadratic").training["td"]
+    linear, mlp = (compose(["env=quadratic", f"network={name}"]).network for name in ("linear", "mlp"))
+    assert (linear.features, mlp.features) == (tuned["network.features"], "identity")
+    assert mlp.squash == linear.squash == tuned["network.squash"]
+    assert compose(["env=pendulum", "network=linear"]).network.features == "identity"
+    assert compose(["env=pendulum"]).network.features == "polynomial"
+
+
+def test_tuned_minibatches_divide_the_environments_asked_for():
+    """Where nobody has asked for minibatches; those that were are refused if they do not (tests/test_bad_input.py)."""
+    tuned = envs.find("pendulum").training["ppo"]["algo.minibatches"]
+    assert [compose([f"num_envs={n}"]).algo.minibatches for n in (1, 2, 12, 4 * tuned)] == [1, 2, 6, tuned]
+    assert compose(["num_envs=8", "algo.minibatches=8"]).algo.minibatches == 8
 
 
 @pytest.mark.parametrize("algo", [("algo=td",), ("algo=ppo", "algo.epochs=3", "algo.minibatches=2")])
@@ -48,6 +77,55 @@ def test_reuse_is_what_the_options_say():
     options = ("algo.epochs=3", "algo.minibatches=2", "algo.clip=null", "algo.max_kl=0.1", "algo.value_clip=0.5")
     assert make_reuse(compose(["algo=ppo", *options])) == Reuse(3, 2, None, 0.5, 0.1)
     assert make_reuse(compose(["algo=td"])) is None
+
+
+def trained(*options, chunks=2):
+    """The state after some chunks, its evaluation, and the metrics."""
+    config = compose([*SIZES, "log_interval=40", "eval_episodes=4", *options])
+    program = compile_program(config, make_env(config), chunk=2)
+    train = program.init().train
+    for _ in range(chunks):
+        train, metrics = program.advance(train)
+    assert jax.tree.map(np.shape, train) == jax.tree.map(np.shape, program.state_shape.train)
+    return train, metrics, program.evaluate(current_policy(train))
+
+
+def test_agents_side_by_side_are_the_agents_alone():
+    """To the bit, parameters, metrics and evaluations: they are computed by the same program."""
+    together = trained("seed=3", "num_seeds=3")
+    for i in range(3):
+        alone = trained(f"seed={3 + i}")
+        jax.tree.map(lambda a, b, i=i: np.testing.assert_array_equal(a[i : i + 1], b), together, alone)
+    assert len(np.unique(together[2].episode_return.sum(axis=1))) == 3
+
+
+def test_agents_in_one_program_are_the_agents_alone():
+    """To rounding, two in each of two programs."""
+    with jax.debug_key_reuse(False):  # see test_vmapped_seeds_are_single_seeds
+        together = trained("num_seeds=4", "vmap_seeds=2")
+    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-4, atol=1e-5), together, trained("num_seeds=4"))
+
+
+SWEEP = ("sweep.algo.gamma=[0.9,0.99]", "sweep.network.sigma=[0.3,0.6]")
+
+
+def test_agents_of_a_sweep_are_the_agents_of_their_settings():
+    """To the bit those of a sweep of that setting alone; to rounding those with the values as constants."""
+    together = trained("seed=3", "num_seeds=2", *SWEEP)
+    for i, gamma, sigma, seed in ((2, 0.9, 0.6, 3), (7, 0.99, 0.6, 4)):
+        agent = jax.tree.map(lambda x, i=i: x[i : i + 1], together)
+        swept = trained(f"seed={seed}", f"sweep.algo.gamma=[{gamma}]", f"sweep.network.sigma=[{sigma}]")
+        jax.tree.map(np.testing.assert_array_equal, agent, swept)
+        alone = trained(f"seed={seed}", f"algo.gamma={gamma}", f"network.sigma={sigma}")
+        jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-4, atol=1e-5), agent, alone)
+    assert len(np.unique(together[2].episode_return.sum(axis=1))) == 8
+
+
+def test_settings_in_one_program_are_the_settings_alone():
+    """To rounding."""
+    with jax.debug_key_reuse(False):  # see test_vmapped_seeds_are_single_seeds
+        together = trained("vmap_seeds=4", *SWEEP)
+    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-4, atol=1e-5), together, trained(*SWEEP))
 
 
 @pytest.mark.parametrize("algo", ["td", "ppo"])

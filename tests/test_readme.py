@@ -23,7 +23,7 @@ def test_commands_run(command, tmp_path):
     lines = [
         line for block in blocks("bash") for line in block.splitlines() if line.startswith(".venv/bin/python -m jaxpg")
     ]
-    assert len(lines) == 5
+    assert len(lines) == 8
     tiny = ["num_envs=2", "num_steps=2", "total_steps=4", "eval_episodes=2"]
     for line in lines:
         _, _, module, *arguments = shlex.split(line)

@@ -15,6 +15,7 @@ import contextlib
 import hashlib
 import os
 import platform
+import re
 import shutil
 import stat
 import tempfile
@@ -38,6 +39,8 @@ REJECTED = "rejected"  # a file where the entries belong, on a machine that cann
 UNREADABLE = "Error reading persistent compilation cache entry"
 # XLA's words, on standard error, for a program that it takes for another machine's; some CPUs never know their own.
 OTHER_MACHINE = b"Machine type used for XLA:CPU compilation"
+# The same of what is no capability but a choice between instructions, which it makes on every CPU with AVX-512.
+PREFERENCE = re.compile(rb"feature \+?prefer-")
 
 
 class CacheError(Exception):
@@ -70,7 +73,7 @@ def compilation_cache(enabled: bool, say: Callable[[str], None]) -> Iterator[Non
 
 
 def _compile_in(store: Store, staging: Path, say: Callable[[str], None]) -> Iterator[None]:
-    with warnings.catch_warnings(record=True) as caught, _without_other_machine(bool(store.loaded)) as refusals:
+    with warnings.catch_warnings(record=True) as caught, _without_other_machine() as refusals:
         warnings.simplefilter("always")
         with _jax_cache_in(staging):
             yield
@@ -229,15 +232,12 @@ def _digest(content: bytes) -> str:
 
 
 @contextlib.contextmanager
-def _without_other_machine(needed: bool) -> Iterator[list[bytes]]:
-    """Standard error without XLA's lines about another machine, which are collected; only where `needed`.
+def _without_other_machine() -> Iterator[list[bytes]]:
+    """Standard error without XLA's lines about another machine, of which refusals are kept.
 
     They are written by C++, so the file descriptor itself is led through a pipe.
     """
     refusals: list[bytes] = []
-    if not needed:
-        yield refusals
-        return
     before, (reader, writer) = os.dup(2), os.pipe()
     os.dup2(writer, 2)
     os.close(writer)
@@ -254,7 +254,7 @@ def _without_other_machine(needed: bool) -> Iterator[list[bytes]]:
 def _filter(reader: int, writer: int, refusals: list[bytes]) -> None:
     with os.fdopen(reader, "rb") as lines:
         for line in lines:
-            if OTHER_MACHINE in line:
-                refusals.append(line)
-            else:
+            if OTHER_MACHINE not in line:
                 os.write(writer, line)
+            elif not PREFERENCE.search(line):
+                refusals.append(line)

@@ -7,8 +7,16 @@ after. Saves are synchronous (an asynchronous one is lost, with status 0, if the
 
 from __future__ import annotations
 
+import contextlib
+import functools
 import hashlib
-from collections.abc import Mapping
+import json
+import logging
+import os
+import re
+import shutil
+import sys
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -17,11 +25,16 @@ import numpy as np
 from orbax import checkpoint as ocp
 
 from jaxpg.run.errors import UserError
+from jaxpg.run.state import is_key
 from jaxpg.types import PyTree
 
 
 class CheckpointError(UserError):
     """A checkpoint that is missing, damaged, or of another program."""
+
+
+class SaveError(Exception):
+    """A checkpoint that could not be written: where and why."""
 
 
 class Checkpoints:
@@ -30,38 +43,104 @@ class Checkpoints:
     Args:
       folder: where they are or will be.
       keep: how many of the newest are kept.
+      read_only: for whoever only looks: what is left of an unfinished save stays, as the run may be saving just now.
+
+    Raises:
+      CheckpointError: the folder cannot be made or read.
     """
 
-    def __init__(self, folder: Path, keep: int = 3):
+    def __init__(self, folder: Path, keep: int = 3, read_only: bool = False):
         self.folder = folder.resolve()
-        self._manager = ocp.CheckpointManager(
-            self.folder,
-            item_names=("state", "meta"),
-            options=ocp.CheckpointManagerOptions(
-                max_to_keep=keep, enable_async_checkpointing=False, cleanup_tmp_directories=True
-            ),
+        self._options = ocp.CheckpointManagerOptions(
+            max_to_keep=keep,
+            enable_async_checkpointing=False,
+            cleanup_tmp_directories=not read_only,
+            create=not read_only,
         )
+        self._manager = self._open()
+        self._failed = False
+
+    def _open(self) -> ocp.CheckpointManager:
+        try:
+            return ocp.CheckpointManager(self.folder, item_names=("state", "meta"), options=self._options)
+        except Exception as error:
+            raise CheckpointError(f"{self.folder}: not a folder for checkpoints ({_reason(error)})") from error
 
     def latest(self) -> int | None:
         """The newest checkpoint's number, or None where there is none."""
         return self._manager.latest_step()
 
+    def newest_sound(self) -> tuple[int, list[str]]:
+        """The newest checkpoint that is undamaged, and what is wrong with those after it, one line each.
+
+        Raises:
+          CheckpointError: there are checkpoints, and none is sound.
+        """
+        problems = []
+        for step in self.numbers():
+            try:
+                self.read(step)
+                return step, problems
+            except CheckpointError as error:
+                problems.append(str(error))
+        raise CheckpointError(problems[0] if len(problems) == 1 else f"{problems[0]}; and none before it is sound")
+
+    def numbers(self) -> list[int]:
+        """The numbers of all checkpoints, the newest first."""
+        return sorted(self._manager.all_steps(), reverse=True)
+
     def save(self, step: int, tree: PyTree, meta: Mapping[str, Any]) -> None:
-        """Writes `tree` and `meta` as checkpoint `step`; raises RuntimeError if orbax declines."""
+        """Writes `tree` and `meta` as checkpoint `step`.
+
+        Raises:
+          SaveError: it cannot be written; nothing is left of it. RuntimeError: orbax declines.
+        """
         leaves = _host_leaves(tree)
         content = {name: leaf for name, leaf in leaves.items() if leaf.size}  # orbax refuses empty arrays
         record = {"meta": dict(meta), "leaves": {name: _describe(leaf) for name, leaf in leaves.items()}}
-        saved = self._manager.save(
-            step, args=ocp.args.Composite(state=ocp.args.StandardSave(content), meta=ocp.args.JsonSave(record))
-        )
+        arguments = ocp.args.Composite(state=ocp.args.StandardSave(content), meta=ocp.args.JsonSave(record))
+        with self._writing(step):
+            saved = self._manager.save(step, args=arguments)
+            if self._failed:  # what still wrote for the failed save may have written into this one
+                self.read(step)
         if not saved:
             raise RuntimeError(f"orbax declined to save step {step} after step {self.latest()}")
+        self._failed = False
 
     def replace(self, step: int, tree: PyTree, meta: Mapping[str, Any]) -> None:
-        """Writes checkpoint `step` as the newest, also where one of the same or a later number is there already."""
-        for later in [number for number in self._manager.all_steps() if number >= step]:
-            self._manager.delete(later)
+        """Writes checkpoint `step` as the newest, also where one of the same or a later number is there already.
+
+        Raises:
+          SaveError, RuntimeError: as `save`.
+        """
+        with self._writing(step):
+            for later in [number for number in self.numbers() if number >= step]:
+                self._manager.delete(later)
         self.save(step, tree, meta)
+
+    @contextlib.contextmanager
+    def _writing(self, step: int) -> Iterator[None]:
+        """Whatever orbax raises inside is a SaveError, and is forgotten before the next save."""
+        _silence_what_is_left_behind()
+        try:
+            self.folder.mkdir(exist_ok=True)  # not its parents: a run folder that is gone is not made again
+            if self._failed:
+                self._start_anew()
+            yield
+        except Exception as error:  # a full disk surfaces as any of a dozen types
+            self._failed = True
+            self._remove_unfinished()
+            raise SaveError(f"{self.folder / str(step)}: cannot be written ({_reason(error)})") from error
+
+    def _start_anew(self) -> None:
+        """With what is on the disk now, whatever orbax remembers of the failed save."""
+        self._remove_unfinished()
+        self._manager = self._open()
+
+    def _remove_unfinished(self) -> None:
+        """What a failed save has left: it takes space."""
+        for unfinished in self.folder.glob("*.orbax-checkpoint-tmp*"):
+            shutil.rmtree(unfinished, ignore_errors=True)
 
     def record(self, step: int) -> dict[str, Any]:
         """What was written beside the arrays: `meta`, and `leaves`, name -> [shape, type, SHA-256].
@@ -70,6 +149,24 @@ class Checkpoints:
           CheckpointError: it cannot be read.
         """
         return self._read(step, meta=ocp.args.JsonRestore())["meta"]
+
+    def read(self, step: int) -> dict[str, np.ndarray]:
+        """Every leaf of checkpoint `step` by its name, verified; random keys as the numbers that they are stored as.
+
+        Raises:
+          CheckpointError: it cannot be read, or its content is damaged.
+        """
+        recorded = self.record(step)["leaves"]
+        kinds = {name: jax.ShapeDtypeStruct(shape, dtype) for name, (shape, dtype, _) in recorded.items()}
+        stored = {name: kind for name, kind in kinds.items() if kind.size}
+        restored = self._read(step, state=ocp.args.StandardRestore(stored))["state"]
+        leaves = {
+            name: np.asarray(restored.get(name, np.zeros(kind.shape, kind.dtype))) for name, kind in kinds.items()
+        }
+        for name, leaf in leaves.items():
+            if _describe(leaf) != recorded[name]:
+                raise CheckpointError(f"{self.folder / str(step)}: damaged, {name} differs from what was saved")
+        return leaves
 
     def restore(self, step: int, template: PyTree) -> PyTree:
         """The tree of checkpoint `step`, every leaf verified.
@@ -81,20 +178,21 @@ class Checkpoints:
         Raises:
           CheckpointError: it cannot be read, was made by another program, or its content is damaged.
         """
-        recorded = self.record(step)["leaves"]
         paths, structure = jax.tree_util.tree_flatten_with_path(template)
         expected = {_name(path): leaf for path, leaf in paths}
-        self._check_same_program(step, recorded, expected)
-        targets = {name: _storage(leaf) for name, leaf in expected.items()}
-        targets = {name: target for name, target in targets.items() if target.size}
-        restored = self._read(step, state=ocp.args.StandardRestore(targets))["state"]
-        leaves = []
-        for name, leaf in expected.items():
-            array = restored.get(name, np.zeros(_storage(leaf).shape, _storage(leaf).dtype))
-            if _describe(np.asarray(array)) != recorded[name]:
-                raise CheckpointError(f"{self.folder / str(step)}: damaged, {name} differs from what was saved")
-            leaves.append(_from_storage(array, leaf))
+        self._check_same_program(step, self.record(step)["leaves"], expected)
+        arrays = self.read(step)
+        leaves = [_from_storage(arrays[name], leaf) for name, leaf in expected.items()]
         return jax.tree_util.tree_unflatten(structure, leaves)
+
+    def digest(self, step: int) -> str:
+        """SHA-256 of the names, shapes, types and digests of all leaves: equal where the states are, bit for bit.
+
+        Raises:
+          CheckpointError: the record cannot be read.
+        """
+        leaves = json.dumps(self.record(step)["leaves"], sort_keys=True)
+        return hashlib.sha256(leaves.encode()).hexdigest()
 
     def _check_same_program(self, step: int, recorded: Mapping[str, Any], expected: Mapping[str, Any]) -> None:
         names = sorted(recorded.keys() ^ expected.keys())
@@ -111,11 +209,36 @@ class Checkpoints:
                 )
 
     def _read(self, step: int, **items: Any) -> Any:
+        _silence_what_is_left_behind()
         try:
             return self._manager.restore(step, args=ocp.args.Composite(**items))
         except Exception as error:  # a damaged file surfaces as any of a dozen types
-            first_line = (str(error).splitlines() or [type(error).__name__])[0]
-            raise CheckpointError(f"{self.folder / str(step)}: cannot be read ({first_line})") from error
+            raise CheckpointError(f"{self.folder / str(step)}: cannot be read ({_reason(error)})") from error
+
+
+def _reason(error: BaseException) -> str:
+    """The operating system's words, if it has refused something, and else the first line of the message."""
+    cause: BaseException | None = error
+    while cause is not None:
+        code = re.search(r"os_error_code='(\d+)'", str(cause))  # tensorstore's, in a ValueError
+        if code or (isinstance(cause, OSError) and cause.errno):
+            return os.strerror(int(code[1]) if code else cause.errno)
+        cause = cause.__cause__ or cause.__context__
+    return (str(error).splitlines() or [type(error).__name__])[0]
+
+
+@functools.cache
+def _silence_what_is_left_behind() -> None:
+    """What orbax leaves behind at a failure, which it raises too, ends with a traceback of its own."""
+    report = sys.unraisablehook
+
+    def hook(unraisable: Any) -> None:
+        if str(unraisable.exc_value) != "Event loop is closed":
+            report(unraisable)
+
+    sys.unraisablehook = hook
+    for name, words in (("absl", "_SignalingThread.run() raised"), ("asyncio", "exception was never retrieved")):
+        logging.getLogger(name).addFilter(lambda record, words=words: words not in record.getMessage())
 
 
 def _host_leaves(tree: PyTree) -> dict[str, np.ndarray]:
@@ -127,12 +250,8 @@ def _name(path: tuple) -> str:
     return jax.tree_util.keystr(path, simple=True, separator="/")
 
 
-def _is_key(leaf: Any) -> bool:
-    return jax.dtypes.issubdtype(leaf.dtype, jax.dtypes.prng_key)
-
-
 def _to_storage(leaf: Any) -> Any:
-    return jax.random.key_data(leaf) if _is_key(leaf) else leaf
+    return jax.random.key_data(leaf) if is_key(leaf) else leaf
 
 
 def _storage(leaf: Any) -> jax.ShapeDtypeStruct:
@@ -141,7 +260,7 @@ def _storage(leaf: Any) -> jax.ShapeDtypeStruct:
 
 def _from_storage(array: Any, leaf: Any) -> jax.Array:
     array = jax.device_put(array)  # jax.numpy.asarray would compile a program for it
-    return jax.random.wrap_key_data(array, impl=jax.random.key_impl(leaf)) if _is_key(leaf) else array
+    return jax.random.wrap_key_data(array, impl=jax.random.key_impl(leaf)) if is_key(leaf) else array
 
 
 def _describe(leaf: np.ndarray) -> list[Any]:

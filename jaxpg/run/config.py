@@ -9,17 +9,18 @@ on it, and else from the dataclasses.
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 import envs
 from envs.options import OptionError, build, unknown
+from jaxpg.run import sweep as sweeping
 from jaxpg.run.errors import UserError
-from jaxpg.run.schema import GROUPS, Run
+from jaxpg.run.schema import GROUPS, Gaussian, Run, option_fields
 
-DEFAULT_CHOICES = {"env": "pendulum", "algo": "td", "network": "mlp"}
+DEFAULT_CHOICES = {"env": "pendulum", "algo": "td", "network": "mlp"}  # algo: the first that the environment has tuned
 FOLDERS = ("run_dir", "resume", "run")  # options whose value is a path
 DEFAULT_ROLLOUT = 16  # steps of a TD rollout where neither the user nor the environment says
 
@@ -32,6 +33,7 @@ class Config:
       choices: group -> member, such as `{"env": "pendulum", "algo": "td", "network": "mlp"}`.
       env, algo, network: the members' options, dataclasses of `GROUPS`.
       run: the run's own options.
+      sweep: option -> its values, for what is swept; the options themselves then count for nothing.
     """
 
     choices: Mapping[str, str]
@@ -39,24 +41,33 @@ class Config:
     algo: Any
     network: Any
     run: Run
+    sweep: Mapping[str, list[float]] = field(default_factory=dict)
+
+    @property
+    def num_agents(self) -> int:
+        return len(sweeping.settings(self.sweep)) * self.run.num_seeds
 
     def to_dict(self) -> dict[str, Any]:
         """Plain nested values, as written to `config.yaml`; `from_dict` is its inverse."""
         groups = {
             group: {"id": choice, **dataclasses.asdict(getattr(self, group))} for group, choice in self.choices.items()
         }
-        return groups | dataclasses.asdict(self.run)
+        return groups | dataclasses.asdict(self.run) | {"sweep": dict(self.sweep)}
 
 
-def from_dict(values: Mapping[str, Any]) -> Config:
+def from_dict(values: Mapping[str, Any], problems: Sequence[str] = ()) -> Config:
     """The configuration in plain nested values, once everything in it has been checked.
 
+    Args:
+      values: as `Config.to_dict` makes them; without a sweep nothing is swept.
+      problems: what is known to be wrong already.
+
     Raises:
-      OptionError: lists every unknown name, wrong type and value out of range.
+      OptionError: lists these, and every unknown name, wrong type and value out of range.
     """
     choices = {group: values[group]["id"] for group in GROUPS}
-    problems, parts = [], {}
-    rest = {name: value for name, value in values.items() if name not in GROUPS}
+    problems, parts = list(problems), {}
+    rest = {name: value for name, value in values.items() if name not in (*GROUPS, "sweep")}
     sections = [(group, GROUPS[group][choices[group]], dict(values[group])) for group in GROUPS] + [("", Run, rest)]
     for name, schema, options in sections:
         options.pop("id", None)
@@ -64,6 +75,10 @@ def from_dict(values: Mapping[str, Any]) -> Config:
             parts[name or "run"] = build(schema, options, prefix=f"{name}." if name else "")
         except OptionError as error:
             problems += error.problems
+    try:
+        parts["sweep"] = sweeping.check(values.get("sweep", {}), choices)
+    except OptionError as error:
+        problems += error.problems
     if problems:
         raise OptionError(problems)
     return _complete(Config(choices, **parts))
@@ -71,35 +86,53 @@ def from_dict(values: Mapping[str, Any]) -> Config:
 
 def _complete(config: Config) -> Config:
     """The rollout length filled in, which depends on algorithm and environment."""
-    given, horizon = config.run.num_steps, config.env.episode_length
+    problems = [*_conflicts_of_the_algorithm(config), *_conflicts_of_the_network(config), *_conflicts_of_agents(config)]
+    if problems:
+        raise OptionError(problems)
+    default = config.env.episode_length if config.choices["algo"] == "reinforce" else DEFAULT_ROLLOUT
+    return dataclasses.replace(config, run=dataclasses.replace(config.run, num_steps=config.run.num_steps or default))
+
+
+def _conflicts_of_the_algorithm(config: Config) -> Iterator[str]:
+    algo, run, horizon = config.algo, config.run, config.env.episode_length
     if config.choices["algo"] == "reinforce":
-        if given not in (None, horizon):
-            raise OptionError(
-                [f"num_steps={given}: algo=reinforce plays whole episodes, {horizon} steps here; leave it out"]
-            )
-        given = horizon
-        if config.algo.baseline == "leave_one_out" and config.run.num_envs < 2:
-            raise OptionError(["algo.baseline=leave_one_out needs other episodes: num_envs must be at least 2"])
-        if config.algo.discounted and config.algo.returns == "whole":
-            raise OptionError(["algo.discounted=true: whole returns have the factors gamma^t in them; leave it out"])
-    if config.choices["algo"] == "ppo" and config.run.num_envs % config.algo.minibatches:
-        divisors = [n for n in range(1, config.run.num_envs + 1) if config.run.num_envs % n == 0]
-        nearest = min(divisors, key=lambda n: abs(n - config.algo.minibatches))
-        raise OptionError(
-            [
-                f"algo.minibatches={config.algo.minibatches} does not divide num_envs={config.run.num_envs}: "
-                f"the nearest that does is {nearest}"
-            ]
+        if run.num_steps not in (None, horizon):
+            yield f"num_steps={run.num_steps}: algo=reinforce plays whole episodes, {horizon} steps here; leave it out"
+        if algo.baseline == "leave_one_out" and run.num_envs < 2:
+            yield "algo.baseline=leave_one_out needs other episodes: num_envs must be at least 2"
+        if algo.discounted and algo.returns == "whole":
+            yield "algo.discounted=true: whole returns have the factors gamma^t in them; leave it out"
+    if config.choices["algo"] == "ppo" and run.num_envs % algo.minibatches:
+        yield (
+            f"algo.minibatches={algo.minibatches} does not divide num_envs={run.num_envs}: "
+            f"the nearest that does is {_nearest_divisor(run.num_envs, algo.minibatches)}"
         )
-    if config.choices["algo"] == "online" and config.network.sigma_is == "scheduled":
-        raise OptionError(
-            ["network.sigma_is=scheduled: algo=online has no schedules; fixed, learned and state are left"]
+
+
+def _conflicts_of_the_network(config: Config) -> Iterator[str]:
+    network = config.network
+    if network.sigma_is == "scheduled":
+        if config.choices["algo"] == "online":
+            yield "network.sigma_is=scheduled: algo=online has no schedules; fixed, learned and state are left"
+        if "network.sigma" in config.sweep:
+            yield "sweep.network.sigma: cannot be swept with network.sigma_is=scheduled; each value needs its own run"
+    if network.features == "radial" and network.order < 2:
+        yield f"network.order={network.order}: radial features need at least 2 points of an axis"
+
+
+def _conflicts_of_agents(config: Config) -> Iterator[str]:
+    run = config.run
+    if config.num_agents % run.vmap_seeds:
+        yield (
+            f"vmap_seeds={run.vmap_seeds} does not divide the number of agents, {config.num_agents}: "
+            f"the nearest that does is {_nearest_divisor(config.num_agents, run.vmap_seeds)}"
         )
-    if config.choices["network"] == "linear" and config.network.features == "radial" and config.network.order < 2:
-        raise OptionError([f"network.order={config.network.order}: radial features need at least 2 points of an axis"])
-    if config.run.num_seeds + config.run.seed > 2**32:
-        raise OptionError([f"seed={config.run.seed} num_seeds={config.run.num_seeds}: seeds must stay below 2**32"])
-    return dataclasses.replace(config, run=dataclasses.replace(config.run, num_steps=given or DEFAULT_ROLLOUT))
+    if run.num_seeds + run.seed > 2**32:
+        yield f"seed={run.seed} num_seeds={run.num_seeds}: seeds must stay below 2**32"
+
+
+def _nearest_divisor(number: int, to: int) -> int:
+    return min((n for n in range(1, number + 1) if number % n == 0), key=lambda n: abs(n - to))
 
 
 def compose(arguments: Sequence[str]) -> Config:
@@ -112,12 +145,16 @@ def compose(arguments: Sequence[str]) -> Config:
       OptionError, UserError: every unknown name, wrong type and value out of range; or text that is no override.
     """
     given = parse(arguments)
-    tuned = _tuned(DEFAULT_CHOICES | _members(given))
+    _check_choices(_members(given))
+    tuned = _fitting(_tuned(_members(given)), given.get("num_envs"))
     choices = DEFAULT_CHOICES | _members(tuned) | _members(given)
-    _check_names(given, choices)
-    fields = option_fields(choices)
-    values = {name: value for name, value in (tuned | given).items() if name in fields}
-    return from_dict(_hydra_compose(choices, values))
+    _check_choices(choices)
+    swept, plain = _divide(given)
+    problems = _unknown_names(plain, choices)
+    problems += [f"{name} is given and swept: leave out one of them" for name in plain if name in swept]
+    values = {name: value for name, value in tuned.items() if name in _tunable(tuned, choices)} | plain
+    values = {name: value for name, value in values.items() if name in option_fields(choices)}
+    return from_dict({**_hydra_compose(choices, values), "sweep": swept}, problems)
 
 
 def _members(values: Mapping[str, Any]) -> dict[str, Any]:
@@ -125,10 +162,36 @@ def _members(values: Mapping[str, Any]) -> dict[str, Any]:
     return {name: value for name, value in values.items() if name in GROUPS}
 
 
-def _tuned(choices: Mapping[str, Any]) -> Mapping[str, Any]:
-    """What the environment's registry entry says for the algorithm; nothing where there is no such environment."""
-    entry = envs.REGISTRY.get(choices["env"])
-    return entry.training.get(choices["algo"], {}) if entry else {}
+def _divide(values: Mapping[str, Any]) -> tuple[dict[str, Any], dict[str, Any]]:
+    """What is swept, by the names of the options, and the other values."""
+    swept = {name: value for name, value in values.items() if name.startswith(sweeping.PREFIX)}
+    plain = {name: value for name, value in values.items() if name not in swept}
+    return {name.removeprefix(sweeping.PREFIX): value for name, value in swept.items()}, plain
+
+
+def _tuned(chosen: Mapping[str, Any]) -> Mapping[str, Any]:
+    """What the environment's registry entry says: its algorithm where none was chosen, and that one's values."""
+    entry = envs.REGISTRY.get(chosen.get("env", DEFAULT_CHOICES["env"]))
+    if entry is None:
+        return {}
+    algo = chosen.get("algo", next(iter(entry.training)))
+    return {"algo": algo, **entry.training.get(algo, {})}
+
+
+def _tunable(tuned: Mapping[str, Any], choices: Mapping[str, str]) -> set[str]:
+    """The options whose tuned values count: those of another network than the chosen one say nothing of it."""
+    known = set(option_fields(choices))
+    if choices["network"] == tuned.get("network", DEFAULT_CHOICES["network"]):
+        return known
+    own = {field.name for field in dataclasses.fields(GROUPS["network"][choices["network"]])}
+    return known - {f"network.{name}" for name in own - {field.name for field in dataclasses.fields(Gaussian)}}
+
+
+def _fitting(tuned: Mapping[str, Any], num_envs: Any) -> Mapping[str, Any]:
+    """The tuned values with a number of minibatches that divides the environments asked for."""
+    if "algo.minibatches" not in tuned or not isinstance(num_envs, int) or num_envs < 1:
+        return tuned
+    return {**tuned, "algo.minibatches": _nearest_divisor(num_envs, tuned["algo.minibatches"])}
 
 
 def parse(arguments: Sequence[str]) -> dict[str, Any]:
@@ -170,14 +233,16 @@ def _plain(value: Any) -> Any:
     return value if isinstance(value, (bool, int, float)) or value is None else str(getattr(value, "text", value))
 
 
-def _check_names(given: Mapping[str, Any], choices: Mapping[str, Any]) -> None:
-    problems = [
-        unknown(group, str(choices[group]), members)
-        for group, members in GROUPS.items()
-        if choices[group] not in members
-    ]
+def _check_choices(choices: Mapping[str, Any]) -> None:
+    names = {group: str(choice) for group, choice in choices.items()}
+    problems = [unknown(group, name, GROUPS[group]) for group, name in names.items() if name not in GROUPS[group]]
     if problems:
         raise OptionError(problems)
+
+
+def _unknown_names(given: Mapping[str, Any], choices: Mapping[str, Any]) -> list[str]:
+    """A line for each name that is no option and no group."""
+    problems = []
     known = set(option_fields(choices)) | set(GROUPS)
     leaves = {name.rsplit(".", 1)[-1]: name for name in known}
     for name in given:
@@ -186,16 +251,7 @@ def _check_names(given: Mapping[str, Any], choices: Mapping[str, Any]) -> None:
             problems.append(
                 f"unknown option '{name}': did you mean '{same_leaf}'?" if same_leaf else unknown("option", name, known)
             )
-    if problems:
-        raise OptionError(problems)
-
-
-def option_fields(choices: Mapping[str, str]) -> dict[str, dataclasses.Field]:
-    """Every option under these choices, by its name on the command line."""
-    fields = {field.name: field for field in dataclasses.fields(Run)}
-    for group, choice in choices.items():
-        fields |= {f"{group}.{field.name}": field for field in dataclasses.fields(GROUPS[group][choice])}
-    return fields
+    return problems
 
 
 def _hydra_compose(choices: Mapping[str, str], values: Mapping[str, Any]) -> dict[str, Any]:
@@ -217,11 +273,11 @@ def _hydra_compose(choices: Mapping[str, str], values: Mapping[str, Any]) -> dic
     return OmegaConf.to_container(composed, resolve=True)
 
 
-def save(config: Config, path: Path) -> None:
-    """Writes `config.yaml`."""
+def to_yaml(config: Config) -> str:
+    """The content of `config.yaml`; `load` reads it."""
     from omegaconf import OmegaConf
 
-    path.write_text(OmegaConf.to_yaml(OmegaConf.create(config.to_dict())), encoding="utf-8")
+    return OmegaConf.to_yaml(OmegaConf.create(config.to_dict()))
 
 
 def load(path: Path) -> Config:
@@ -246,23 +302,26 @@ def change(config: Config, changes: Mapping[str, Any]) -> Config:
     Raises:
       OptionError: an unknown name, another member of a group, a wrong type or a value out of range.
     """
-    _check_names(changes, config.choices | _members(changes))
+    _check_choices(config.choices | _members(changes))
     others = [name for name in GROUPS if changes.get(name, config.choices[name]) != config.choices[name]]
     if others:
         raise OptionError([f"{name}={changes[name]}: the run has {name}={config.choices[name]}" for name in others])
-    values = config.to_dict()
-    for name, value in changes.items():
+    swept, plain = _divide(changes)
+    problems, values = _unknown_names(plain, config.choices), config.to_dict()
+    values["sweep"] |= swept
+    for name, value in plain.items():
         group, _, leaf = name.rpartition(".")
-        if name not in GROUPS:
+        if name in option_fields(config.choices):
             (values[group] if group else values)[leaf] = value
-    return from_dict(values)
+    return from_dict(values, problems)
 
 
 def flatten(config: Config) -> dict[str, Any]:
-    """The values of all options by their names on the command line."""
+    """The values of all options, and of the sweep, by their names on the command line."""
     values = config.to_dict()
-    return {
+    options = {
         name: values[group][leaf] if group else values[leaf]
         for name in option_fields(config.choices)
         for group, _, leaf in [name.rpartition(".")]
     }
+    return options | {sweeping.PREFIX + name: swept for name, swept in config.sweep.items()}

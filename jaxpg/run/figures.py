@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -19,25 +19,53 @@ def learning_curve(lines: Sequence[dict[str, Any]], path: Path, title: str) -> N
       path: the PNG to write.
       title: above the picture.
     """
-    from matplotlib.figure import Figure
-
-    panels = [("return", [("return", "while training"), ("eval_return", "deterministic policy")])]
-    if any("eval_success" in line for line in lines):
-        panels.append(("success rate", [("eval_success", "deterministic policy")]))
-    figure = Figure(figsize=(6.4 * len(panels), 4.2), layout="constrained")
-    for axes, (ylabel, curves) in zip(figure.subplots(1, len(panels), squeeze=False)[0], panels, strict=True):
-        for name, label in curves:
-            draw_curve(axes, *series(lines, name), label)
-        axes.set(xlabel="environment steps", ylabel=ylabel)
-        axes.grid(alpha=0.3)
+    figure, panels = _panels(lines, title)
+    draw_curve(panels["eval_return"], *series(lines, "return"), "while training")
+    for name, axes in panels.items():
+        draw_curve(axes, *series(lines, name), "deterministic policy")
         axes.legend()
-    figure.suptitle(title)
     figure.savefig(path, dpi=120)
 
 
-def series(lines: Sequence[dict[str, Any]], name: str) -> tuple[np.ndarray, np.ndarray]:
-    """Steps `[K]` and values `[S, K]` of the lines where every agent has a value."""
-    points = [(line["steps"], np.atleast_1d(line[name])) for line in lines if name in line]
+def sweep_curves(lines: Sequence[dict[str, Any]], path: Path, title: str, settings: Mapping[str, slice]) -> None:
+    """Return of the deterministic policy, and success where there is one, over environment steps: a curve a setting.
+
+    Args:
+      lines, path, title: as in `learning_curve`.
+      settings: label -> its agents, in the order of the legend.
+    """
+    figure, panels = _panels(lines, f"{title}, deterministic policy")
+    for name, axes in panels.items():
+        for label, agents in settings.items():
+            _draw(axes, *series(lines, name, agents), label)
+    number = max(agents.stop - agents.start for agents in settings.values())
+    handles, labels = panels["eval_return"].get_legend_handles_labels()
+    title = f"interquartile mean of {number} seeds,\n95 % interval" if number > 1 else None
+    legend = figure.legend(handles, labels, loc="outside right center", title=title, fontsize=8, title_fontsize=8)
+    # Beside the panels, which keep their size.
+    figure.set_figwidth(figure.get_figwidth() + legend.get_window_extent().width / figure.dpi)
+    figure.savefig(path, dpi=120)
+
+
+def _panels(lines: Sequence[dict[str, Any]], title: str) -> tuple[Any, dict[str, Any]]:
+    """An empty figure, and its axes by the name of the metric that they are for."""
+    from matplotlib.figure import Figure
+
+    ylabels = {"eval_return": "return"}
+    if any("eval_success" in line for line in lines):
+        ylabels["eval_success"] = "success rate"
+    figure = Figure(figsize=(6.4 * len(ylabels), 4.2), layout="constrained")
+    panels = dict(zip(ylabels, figure.subplots(1, len(ylabels), squeeze=False)[0], strict=True))
+    for name, axes in panels.items():
+        axes.set(xlabel="environment steps", ylabel=ylabels[name])
+        axes.grid(alpha=0.3)
+    figure.suptitle(title)
+    return figure, panels
+
+
+def series(lines: Sequence[dict[str, Any]], name: str, agents: slice = slice(None)) -> tuple[np.ndarray, np.ndarray]:
+    """Steps `[K]` and values `[S, K]` of the lines where each of the agents has a value."""
+    points = [(line["steps"], np.atleast_1d(line[name])[agents]) for line in lines if name in line]
     points = [(steps, values) for steps, values in points if all(value is not None for value in values)]
     if not points:
         return np.zeros(0), np.zeros((1, 0))
@@ -46,7 +74,14 @@ def series(lines: Sequence[dict[str, Any]], name: str) -> tuple[np.ndarray, np.n
 
 def draw_curve(axes: Any, steps: np.ndarray, values: np.ndarray, label: str) -> None:
     """One curve; of several agents their interquartile mean with its 95 % bootstrap interval."""
+    _draw(axes, steps, values, f"{label}: {_of_seeds(len(values))}" if len(values) > 1 and len(steps) else label)
+
+
+def _draw(axes: Any, steps: np.ndarray, values: np.ndarray, label: str) -> None:
     (line,) = axes.plot(steps, interquartile_mean(values), label=label)
     if len(values) > 1 and len(steps):
-        line.set_label(f"{label}: interquartile mean of {len(values)} seeds, 95 % interval")
         axes.fill_between(steps, *bootstrap_interval(values), color=line.get_color(), alpha=0.2, linewidth=0)
+
+
+def _of_seeds(number: int) -> str:
+    return f"interquartile mean of {number} seeds, 95 % interval"

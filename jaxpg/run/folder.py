@@ -7,23 +7,30 @@ tb/                 the same for TensorBoard
 checkpoints/        the whole training state, the newest few
 best/               the best policy so far
 learning_curve.png  the curve
+lock                who is training in it, for as long as it does
 """
 
 from __future__ import annotations
 
+import contextlib
+import errno
 import importlib.metadata
 import json
 import os
 import platform
 import time
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from jaxpg.run import lock
 from jaxpg.run.config import Config
 from jaxpg.run.errors import UserError
+from jaxpg.run.tensorboard import TensorBoard
 
+UNFINISHED = ".unfinished"  # ends the name of a file that is renamed once it is complete
 RECORDED_PACKAGES = ("jax", "jaxlib", "mujoco", "mujoco-mjx", "brax", "flax", "optax", "orbax-checkpoint", "numpy")
 
 
@@ -41,11 +48,11 @@ class RunFolder:
         self.learning_curve = self.path / "learning_curve.png"
 
 
-def create(config: Config) -> RunFolder:
-    """A new run folder: the one asked for, or `runs/<env>-<algo>-s<seed>-<time>`.
+def planned(config: Config) -> RunFolder:
+    """The run folder asked for, or `runs/<env>-<algo>-s<seed>-<time>`; nothing is made yet.
 
     Raises:
-      UserError: the folder is in use, cannot be made, or has a name that orbax takes for a pattern.
+      UserError: it has a name that orbax takes for a pattern.
     """
     run = config.run
     if run.run_dir is not None:
@@ -56,14 +63,89 @@ def create(config: Config) -> RunFolder:
         folder = RunFolder(Path("runs") / f"{name}-{config.choices['algo']}-s{run.seed}-{stamp}")
     if set("[]") & set(str(folder.path.resolve())):
         raise UserError(f"{folder.path}: checkpoints cannot be kept below a folder with [ or ] in its name")
-    try:
-        if folder.path.exists() and any(folder.path.iterdir()):
-            raise UserError(f"{folder.path} is not empty: take another run_dir, or resume={folder.path}")
-        folder.path.mkdir(parents=True, exist_ok=True)
-        folder.versions.write_text(json.dumps(versions(), indent=1), encoding="utf-8")
-    except OSError as error:
-        raise UserError(f"{folder.path}: cannot write a run folder there ({error.strerror})") from error
     return folder
+
+
+def check_empty(folder: RunFolder) -> None:
+    """Raises UserError where something is in the folder already, or where there can be none."""
+    if _names(folder.path):
+        raise UserError(f"{folder.path} is not empty: take another run_dir, or resume={folder.path}")
+
+
+def check_nothing_to_lose(folder: RunFolder) -> None:
+    """Raises UserError where there is more in the folder than a run leaves that ended before its first checkpoint."""
+    if not _is_run(folder) or _has_numbers(folder.checkpoints) or _has_numbers(folder.best):
+        check_empty(folder)
+
+
+def has_checkpoints(folder: RunFolder) -> bool:
+    """Whether it is the folder of a run with something to resume."""
+    return folder.config.is_file() and _has_numbers(folder.checkpoints)
+
+
+def _has_numbers(path: Path) -> bool:
+    """Whether a checkpoint is there, sound or not: its name is its number."""
+    return any(name.isdigit() for name in _names(path))
+
+
+def _names(path: Path) -> list[str]:
+    """What is in a folder, but for what a process leaves that was killed: its lock and unfinished files."""
+    with _reported(path):
+        names = [entry.name for entry in path.iterdir()] if path.exists() else []
+    return [name for name in names if name != lock.NAME and not name.endswith(UNFINISHED)]
+
+
+def _is_run(folder: RunFolder) -> bool:
+    """Whether a run of ours began there: `versions.json` is the first that it writes."""
+    try:
+        return "jaxlib" in read_versions(folder)
+    except UserError:
+        return False
+
+
+@contextlib.contextmanager
+def owned(folder: RunFolder, say: Callable[[str], None]) -> Iterator[None]:
+    """The folder, made where there is none, is this process's inside.
+
+    Args:
+      folder: of the run.
+      say: takes a note, where the folder cannot be locked.
+
+    Raises:
+      UserError: it is another's, or cannot be made or written to.
+    """
+    with contextlib.ExitStack() as stack:
+        with _reported(folder.path):
+            folder.path.mkdir(parents=True, exist_ok=True)
+            stack.enter_context(lock.held(folder.path, say))
+        yield
+
+
+@contextlib.contextmanager
+def _reported(path: Path) -> Iterator[None]:
+    try:
+        yield
+    except OSError as error:
+        raise UserError(f"{path}: cannot write a run folder there ({error.strerror})") from error
+
+
+def replace(path: Path, text: str) -> None:
+    """Writes a file that others, and who comes after a kill or a power failure, see as it was or whole.
+
+    Raises:
+      UserError: it cannot be written.
+    """
+    unfinished = path.with_name(path.name + UNFINISHED)
+    try:
+        with unfinished.open("w", encoding="utf-8") as file:
+            file.write(text)
+            file.flush()
+            os.fsync(file.fileno())
+        unfinished.replace(path)
+    except OSError as error:
+        with contextlib.suppress(OSError):
+            unfinished.unlink(missing_ok=True)
+        raise UserError(f"{path}: cannot be written ({error.strerror})") from error
 
 
 def find(path: str) -> RunFolder:
@@ -79,6 +161,11 @@ def versions() -> dict[str, Any]:
     packages = {name: importlib.metadata.version(name) for name in RECORDED_PACKAGES}
     machine = {"python": platform.python_version(), "machine": platform.machine(), "threads": num_threads()}
     return packages | machine | {"xla_flags": os.environ.get("XLA_FLAGS", "")}
+
+
+def write_versions(folder: RunFolder) -> None:
+    """Writes `versions.json`, the first file of a run."""
+    replace(folder.versions, json.dumps(versions(), indent=1))
 
 
 def read_versions(folder: RunFolder) -> dict[str, Any]:
@@ -97,31 +184,54 @@ def num_threads() -> int:
 class MetricsLog:
     """`metrics.jsonl` and TensorBoard; on resume, lines after the checkpoint are taken back.
 
+    Lines that cannot be written wait in memory, and are written before the next one. The file is opened anew for each:
+    the folder may be another's, or gone.
+
     Args:
       folder: the run.
       update: updates made so far; later lines are removed.
+      say: takes notes of what cannot be written.
+
+    Raises:
+      UserError: the file cannot be written when the run begins.
     """
 
-    def __init__(self, folder: RunFolder, update: int = 0):
-        from tensorboardX import SummaryWriter
-
+    def __init__(self, folder: RunFolder, update: int, say: Callable[[str], None]):
         kept = [line for line in read_metrics(folder) if line["update"] <= update]
-        self._file = folder.metrics.open("w", encoding="utf-8")
-        self._file.writelines(_json_line(line) for line in kept)
-        self._tensorboard = SummaryWriter(str(folder.tensorboard), purge_step=kept[-1]["steps"] + 1 if kept else 0)
+        text = "".join(map(_json_line, kept))
+        replace(folder.metrics, text)
+        self._path, self._say = folder.metrics, say
+        self._size = len(text)  # of the whole lines in the file; in ASCII a character is a byte
+        self._waiting = ""
+        self._tensorboard = TensorBoard(folder.tensorboard, kept[-1]["steps"] + 1 if kept else 0, say)
         self.seconds = kept[-1]["seconds"] if kept else 0.0
 
     def write(self, line: dict[str, Any]) -> None:
         """Adds one line; values are numbers, or lists of them with one for each agent."""
-        self._file.write(_json_line(line))
-        self._file.flush()
-        for name, value in line.items():
-            mean = _mean(value)
-            if name not in ("update", "steps") and mean is not None:
-                self._tensorboard.add_scalar(name, mean, line["steps"])
+        first = not self._waiting
+        self._waiting += _json_line(line)
+        try:
+            self.flush()
+        except OSError as error:
+            if first:
+                self._say(f"note: {self._path}: cannot be written ({error.strerror}); lines wait until it can")
+        means = {name: _mean(value) for name, value in line.items() if name not in ("update", "steps")}
+        self._tensorboard.write({name: mean for name, mean in means.items() if mean is not None}, line["steps"])
+
+    def flush(self) -> None:
+        """Writes the lines that wait; raises OSError where the file has not got all of them."""
+        if not self._waiting:
+            return
+        with self._path.open("r+b") as file:
+            if file.seek(0, os.SEEK_END) < self._size:
+                raise OSError(errno.EIO, "lines that were written are not there any more")
+            file.truncate(self._size)  # what a failure has left of a line
+            file.seek(self._size)
+            file.write(self._waiting.encode())
+        self._size += len(self._waiting)
+        self._waiting = ""
 
     def close(self) -> None:
-        self._file.close()
         self._tensorboard.close()
 
 

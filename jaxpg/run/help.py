@@ -3,12 +3,19 @@
 from __future__ import annotations
 
 import dataclasses
+import textwrap
 from collections.abc import Sequence
 from typing import Any
 
 from envs.options import describe
-from jaxpg.run.config import compose, flatten, option_fields
-from jaxpg.run.schema import GROUPS, EvaluateOptions, Run
+from jaxpg.run.config import compose, flatten
+from jaxpg.run.schema import GROUPS, Run, option_fields
+from jaxpg.run.sweep import sweepable
+
+SWEEP = (
+    "sweep.NAME=[VALUE,VALUE,...] trains agents with each value of the option NAME, all in one program; with several "
+    "NAMEs all combinations of their values. NAME is one of"
+)
 
 
 def train_help(arguments: Sequence[str]) -> str:
@@ -18,6 +25,7 @@ def train_help(arguments: Sequence[str]) -> str:
     lines = [
         "usage: python -m jaxpg.train [group=member] [option=value] ...",
         "       python -m jaxpg.train resume=DIR [total_steps=N]",
+        "       python -m jaxpg.train resume=auto run_dir=DIR [group=member] [option=value] ...",
         "",
         *(f"{group}={config.choices[group]}".ljust(28) + f"one of {', '.join(GROUPS[group])}" for group in GROUPS),
     ]
@@ -25,14 +33,16 @@ def train_help(arguments: Sequence[str]) -> str:
         schema = GROUPS[group][config.choices[group]] if group else Run
         names = [name for name in fields if name.rpartition(".")[0] == group]
         lines += ["", schema.__doc__.splitlines()[0], *(_line(name, values[name], fields[name]) for name in names)]
+    names = ", ".join(sweepable(config.choices))
+    lines += ["", *textwrap.wrap(f"{SWEEP} {names}.", width=120)]
     lines += ["", "Shown are the defaults for the environment and the algorithm named above; add env=... or algo=..."]
     return "\n".join(lines)
 
 
-def evaluate_help() -> str:
-    """Every option of the evaluation."""
-    lines = ["usage: python -m jaxpg.evaluate run=DIR [option=value] ...", "", EvaluateOptions.__doc__]
-    return "\n".join(lines + [_line(field.name, field.default, field) for field in dataclasses.fields(EvaluateOptions)])
+def run_help(command: str, schema: type) -> str:
+    """Every option of a command about a run that is there."""
+    lines = [f"usage: python -m jaxpg.{command} run=DIR [option=value] ...", "", schema.__doc__]
+    return "\n".join(lines + [_line(field.name, field.default, field) for field in dataclasses.fields(schema)])
 
 
 def _line(name: str, value: Any, field: dataclasses.Field) -> str:

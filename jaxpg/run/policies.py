@@ -11,11 +11,13 @@ import numpy as np
 from jaxpg.actor_critic import deterministic_policy
 from jaxpg.run import config as configuration
 from jaxpg.run import folder
+from jaxpg.run.agents import alone, setting_of
 from jaxpg.run.checkpoint import Checkpoints
 from jaxpg.run.config import Config
 from jaxpg.run.errors import UserError
-from jaxpg.run.program import agent_keys, initializer, make_algorithm, make_env, make_networks
+from jaxpg.run.program import make_algorithm, make_env, make_networks, state_shape
 from jaxpg.run.state import Policy, current_policy
+from jaxpg.run.sweep import Setting
 
 
 class StoredPolicy(NamedTuple):
@@ -25,8 +27,8 @@ class StoredPolicy(NamedTuple):
       act: `act(policy, obs) -> action` in [-1, 1], deterministic.
       policy: its parameters; an argument of `act`, so that all policies of a kind are one compiled program.
       env: the environment, with the changes asked for.
-      config: of the run, with the changes.
-      seed: of the agent.
+      config: of the agent as a run of its own, with the changes.
+      setting: of the agent; empty without a sweep.
       update: updates made when the checkpoint was written.
     """
 
@@ -34,7 +36,7 @@ class StoredPolicy(NamedTuple):
     policy: Policy
     env: Any
     config: Config
-    seed: int
+    setting: Setting
     update: int
 
 
@@ -55,15 +57,15 @@ def load(
     run_folder = folder.find(run)
     config = configuration.change(configuration.load(run_folder.config), changes or {})
     env = make_env(config)
-    shape = jax.eval_shape(initializer(config, make_algorithm(config, env)), agent_keys(config))
-    best, update = _restore(Checkpoints(run_folder.best), shape.best, run)
+    shape = state_shape(make_algorithm(config, env), config.num_agents)
+    best, update = _restore(Checkpoints(run_folder.best, read_only=True), shape.best, run)
     if agent is None:
         agent = int(np.argmax(best.episode_return))
-    if not 0 <= agent < config.run.num_seeds:
-        raise UserError(f"agent={agent}: the run has agents 0 to {config.run.num_seeds - 1}")
+    if not 0 <= agent < config.num_agents:
+        raise UserError(f"agent={agent}: the run has agents 0 to {config.num_agents - 1}")
     policy: Policy = best.policy
     if which == "last":
-        state, update = _restore(Checkpoints(run_folder.checkpoints), shape, run)
+        state, update = _restore(Checkpoints(run_folder.checkpoints, read_only=True), shape, run)
         policy = current_policy(state.train)
     policy = jax.tree.map(lambda x: np.asarray(x)[agent], policy)
     networks = make_networks(config, env)
@@ -71,7 +73,7 @@ def load(
     def act(policy, obs):
         return deterministic_policy(networks, policy.params, policy.normalizer)(obs)
 
-    return StoredPolicy(act, policy, env, config, config.run.seed + agent, update)
+    return StoredPolicy(act, policy, env, alone(config, agent), setting_of(config, agent), update)
 
 
 def _restore(checkpoints: Checkpoints, template: Any, run: str) -> tuple[Any, int]:

@@ -15,21 +15,26 @@ import optax
 
 import envs
 from envs.options import OptionError
-from jaxpg.actor_critic import Method, Reuse, actor_critic, deterministic_policy, reinforce, td
+from jaxpg.actor_critic import Method, actor_critic, deterministic_policy, reinforce, td
 from jaxpg.distributions import GAUSSIAN, SQUASHED_GAUSSIAN
 from jaxpg.evaluation import Episodes, evaluate
 from jaxpg.features import num_features
+from jaxpg.learning import Reuse
 from jaxpg.networks import Networks, linear_networks, mlp_networks
 from jaxpg.online import online_actor_critic
+from jaxpg.run.agents import Agents, agents_of, with_values
 from jaxpg.run.config import Config
-from jaxpg.run.state import Policy, RunState, current_policy, start
+from jaxpg.run.folder import num_threads
+from jaxpg.run.state import Policy, RunState, current_policy, is_key, start
 from jaxpg.training import initial_state, train_scan
 from jaxpg.types import Algorithm, Metrics, TrainState
 from jaxpg.vector_env import vectorize
 
 # Evaluations during training play the same starts in every run; `jaxpg.evaluate` draws others.
 SELECTION_SEED = 2**31
-MAX_FEATURES = 10_000  # of a linear network; a grid over many observations is soon beyond any memory
+# Of LLVM. With 3, XLA's default, a training compiles a quarter longer and runs no faster.
+OPTIMIZED, RUN_ONCE = ({"xla_backend_optimization_level": level} for level in (2, 0))
+MAX_FEATURES = 10_000  # a grid over many observations is soon beyond any memory
 
 
 class Schedule(NamedTuple):
@@ -96,8 +101,7 @@ def plan(config: Config, done: int = 0) -> Schedule:
 def make_env(config: Config) -> Any:
     """The environment; raises OptionError where it has a mistake to report, or where the features do not fit it."""
     env = envs.REGISTRY[config.choices["env"]].build(config.env)
-    if config.choices["network"] == "linear":
-        _check_features(config.network, env.observation_size)
+    _check_features(config.network, env.observation_size)
     return env
 
 
@@ -111,14 +115,16 @@ def _check_features(network: Any, observation_size: int) -> None:
 def make_networks(config: Config, env: Any) -> Networks:
     network = config.network
     sizes = env.observation_size, env.action_size
-    policy = {
+    shared = {
+        "features": network.features,
+        "order": network.order,
         "initial_std": network.sigma,
         "sigma": network.sigma_is,
         "distribution": SQUASHED_GAUSSIAN if network.squash else GAUSSIAN,
     }
     if config.choices["network"] == "linear":
-        return linear_networks(*sizes, network.features, network.order, **policy)
-    return mlp_networks(*sizes, network.widths, network.activation, **policy)
+        return linear_networks(*sizes, **shared)
+    return mlp_networks(*sizes, network.widths, network.activation, **shared)
 
 
 def make_algorithm(config: Config, env: Any) -> Algorithm:
@@ -143,7 +149,8 @@ def make_algorithm(config: Config, env: Any) -> Algorithm:
 
 def training_length(config: Config) -> int:
     """Steps of a training episode; TD may cut it before the time limit, where it bootstraps all the same."""
-    return getattr(config.algo, "episode_length", None) or config.env.episode_length
+    limit = config.env.episode_length
+    return min(getattr(config.algo, "episode_length", None) or limit, limit)
 
 
 def make_method(config: Config) -> Method:
@@ -201,61 +208,76 @@ def _labels(params: Any) -> Any:
 
 
 def compile_program(
-    config: Config, env: Any, chunk: int, resumed: bool = False, meanwhile: Callable[[], None] = lambda: None
+    config: Config,
+    env: Any,
+    chunk: int,
+    agents: Agents | None = None,
+    resumed: bool = False,
+    meanwhile: Callable[[], None] = lambda: None,
 ) -> Program:
     """Traces and compiles `chunk` updates, the evaluation and the beginning of a run.
+
+    What is compiled is for `vmap_seeds` agents; all agents are groups of as many, which share the cores. On a CPU that
+    is faster than one program for all of them, and each agent has the bits that it has alone. Seeds and swept values
+    are arguments; an agent has the bits of a run of its own with the same options swept, and but for rounding those of
+    one where they are constants of the program.
 
     Args:
       config, env: of the run.
       chunk: updates of one call.
+      agents: by default those of the configuration.
       resumed: the state comes from a checkpoint; `init` is not compiled.
       meanwhile: called once while XLA compiles in other threads.
     """
-    run = config.run
-    networks, algorithm = make_networks(config, env), make_algorithm(config, env)
-    keys = agent_keys(config)
+    run, agents = config.run, agents or agents_of(config)
+    networks = make_networks(config, env)
 
-    def advance(key, train):
-        return train_scan(algorithm, key, chunk, train)
+    def algorithm(agent):
+        return make_algorithm(with_values(config, agent.values), env)
+
+    def init(agent):
+        return initial_run(algorithm(agent), agent.seed)
+
+    def advance(agent, train):
+        return train_scan(algorithm(agent), jax.random.key(agent.seed), chunk, train)
 
     def play(policy):
         act = deterministic_policy(networks, policy.params, policy.normalizer)
         return evaluate(env, act, jax.random.key(SELECTION_SEED), run.eval_episodes, config.env.episode_length)
 
-    init = initializer(config, algorithm)
-    shape = jax.eval_shape(init, keys)
-    advance, play = over_agents(advance, run.num_seeds), over_agents(play, run.num_seeds)
+    init, advance, play = (over_agents(fn, run.vmap_seeds) for fn in (init, advance, play))
+    of_group = jax.tree.map(lambda x: x[: run.vmap_seeds], agents)
+    shape = jax.eval_shape(init, of_group)
     with ThreadPoolExecutor() as pool:
         # Tracing holds Python's lock and compiling does not: one trace after the other, that of the longest compilation
         # first, so that no compilation waits for another one's trace.
-        advance = pool.submit(jax.jit(advance).lower(keys, shape.train).compile)
-        init = None if resumed else pool.submit(jax.jit(init).lower(keys).compile)
-        play = pool.submit(jax.jit(play).lower(current_policy(shape.train)).compile)
+        advance = pool.submit(jax.jit(advance).lower(of_group, shape.train).compile, OPTIMIZED)
+        init = None if resumed else pool.submit(jax.jit(init).lower(of_group).compile, RUN_ONCE)
+        play = pool.submit(jax.jit(play).lower(current_policy(shape.train)).compile, OPTIMIZED)
         meanwhile()
-    advance, play = advance.result(), play.result()
+    init, advance, play = (in_groups(fn.result(), run.vmap_seeds) if fn else None for fn in (init, advance, play))
     return Program(
-        functools.partial(init.result(), keys) if init else None, functools.partial(advance, keys), play, shape
+        functools.partial(init, agents) if init else None,
+        functools.partial(advance, agents),
+        play,
+        state_shape(make_algorithm(config, env), len(agents.seed)),
     )
 
 
-def agent_keys(config: Config) -> jax.Array:
-    """The random keys of the agents, `[S]`: of the seeds seed, seed + 1, ..."""
-    return jnp.stack([jax.random.key(config.run.seed + i) for i in range(config.run.num_seeds)])
+def initial_run(algorithm: Algorithm, seed: jax.Array) -> RunState:
+    """One agent's run before its first update."""
+    return start(initial_state(algorithm, jax.random.key(seed)))
 
 
-def initializer(config: Config, algorithm: Algorithm) -> Callable[[jax.Array], RunState]:
-    """`init(keys[S]) -> RunState`, the run before its first update."""
-    begin = over_agents(lambda key: initial_state(algorithm, key), config.run.num_seeds)
-
-    def init(keys):
-        return start(begin(keys))
-
-    return init
+def state_shape(algorithm: Algorithm, num_agents: int) -> RunState:
+    """Shapes and types of a run's state, `[S, ...]`."""
+    one = jax.eval_shape(functools.partial(initial_run, algorithm), np.uint32(0))
+    return jax.tree.map(lambda x: jax.ShapeDtypeStruct((num_agents, *x.shape), x.dtype), one)
 
 
-def over_agents(fn: Callable, num_seeds: int) -> Callable:
-    """`fn` for all agents; a single one is not mapped, so that its program branches instead of selecting."""
-    if num_seeds > 1:
+def over_agents(fn: Callable, number: int) -> Callable:
+    """`fn` for some agents; a single one is not mapped, so that its program branches instead of selecting."""
+    if number > 1:
         return jax.vmap(fn)
 
     @functools.wraps(fn)
@@ -264,6 +286,31 @@ def over_agents(fn: Callable, num_seeds: int) -> Callable:
         return jax.tree.map(lambda x: x[None], result)
 
     return one
+
+
+def in_groups(fn: Callable, size: int) -> Callable:
+    """`fn`, compiled for `size` agents, for any multiple of as many: `[S, ...]` to `[S, ...]`.
+
+    The groups run in as many threads as XLA has, which computes without Python's lock; with a single one XLA itself
+    takes them one after the other. One group is handed through as it is; several come back as numpy arrays.
+    """
+
+    def run(*arguments):
+        number = len(jax.tree.leaves(arguments)[0])
+        if number == size:
+            return fn(*arguments)
+        arguments = jax.tree.map(_on_host, arguments)
+        groups = [jax.tree.map(lambda x, i=i: x[i : i + size], arguments) for i in range(0, number, size)]
+        with ThreadPoolExecutor(num_threads()) as pool:
+            results = list(pool.map(lambda group: jax.tree.map(_on_host, fn(*group)), groups))
+        return jax.tree.map(lambda *parts: (jnp if is_key(parts[0]) else np).concatenate(parts), *results)
+
+    return run
+
+
+def _on_host(x: Any) -> Any:
+    """As a numpy array, which is divided without compiling anything; random keys stay what they are."""
+    return x if is_key(x) else np.asarray(x)
 
 
 def _ceil(a: int, b: int) -> int:

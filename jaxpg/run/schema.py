@@ -1,12 +1,15 @@
 """The options of a training run: groups with their members, and the run's own.
 
 Each field has its default, its help and its range. What an environment has its own tuned value for, it says in its
-registry entry.
+registry entry. Those made with `number` can be swept; all others are part of the program.
 """
 
 from __future__ import annotations
 
+import dataclasses
+from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Any
 
 import envs
 from envs.options import option
@@ -15,12 +18,23 @@ from jaxpg.features import FEATURES
 from jaxpg.networks import ACTIVATIONS, SIGMAS
 
 
+def number(default: float | None, help: str, **bounds: float) -> Any:
+    """An option whose value only enters formulas: the program can take it as an argument, so that it can be swept.
+
+    Args:
+      default, help: as in `option`.
+      bounds: those of `option`.
+    """
+    metadata = option(default, help, **bounds).metadata
+    return dataclasses.field(default=default, metadata={**metadata, "sweepable": True})
+
+
 @dataclass(frozen=True)
 class Common:
     """Options that all algorithms share."""
 
-    gamma: float = option(0.99, "discount", at_least=0, at_most=1)
-    reward_scale: float = option(1.0, "factor on the rewards that are learned from", above=0)
+    gamma: float = number(0.99, "discount", at_least=0, at_most=1)
+    reward_scale: float = number(1.0, "factor on the rewards that are learned from", above=0)
     normalize_observations: bool = option(True, "observations with running mean 0 and deviation 1")
 
 
@@ -28,11 +42,11 @@ class Common:
 class Learning(Common):
     """Options that TD and REINFORCE share."""
 
-    actor_lr: float = option(0.002, "Adam step size of the actor", above=0)
-    critic_lr: float = option(0.004, "Adam step size of the critic", above=0)
-    final_lr: float = option(0.1, "step sizes fall linearly to this fraction", at_least=0, at_most=1)
-    max_gradient_norm: float = option(1.0, "longer gradients are shortened to this", above=0)
-    entropy_coef: float = option(0.0, "weight of the entropy bonus", at_least=0)
+    actor_lr: float = number(0.002, "Adam step size of the actor", above=0)
+    critic_lr: float = number(0.004, "Adam step size of the critic", above=0)
+    final_lr: float = number(0.1, "step sizes fall linearly to this fraction", at_least=0, at_most=1)
+    max_gradient_norm: float = number(1.0, "longer gradients are shortened to this", above=0)
+    entropy_coef: float = number(0.0, "weight of the entropy bonus", at_least=0)
     normalize_advantages: bool = option(True, "advantages with mean 0 and deviation 1 over the batch")
 
 
@@ -42,7 +56,7 @@ class TD(Learning):
 
     estimator: str = option("td_lambda", "advantage: td_zero and monte_carlo are lambda 0 and 1", choices=ESTIMATORS)
     n: int = option(5, "rewards that n_step sums", at_least=1)
-    lambda_: float = option(0.95, "weight of longer returns: 0 is TD(0), 1 Monte Carlo", at_least=0, at_most=1)
+    lambda_: float = number(0.95, "weight of longer returns: 0 is TD(0), 1 Monte Carlo", at_least=0, at_most=1)
     episode_length: int | None = option(
         None, "steps after which a training episode is cut and begun anew [default: the environment's]", at_least=1
     )
@@ -54,9 +68,9 @@ class PPO(TD):
 
     epochs: int = option(10, "passes over a rollout", at_least=1)
     minibatches: int = option(1, "gradient steps of a pass; divides num_envs", at_least=1)
-    clip: float | None = option(0.2, "the ratio of the probabilities is clipped at 1 +- this; null: not", above=0)
-    value_clip: float | None = option(None, "values are held within this of the rollout's; null: not", above=0)
-    max_kl: float | None = option(None, "steps end at this KL divergence from the rollout's policy; null: not", above=0)
+    clip: float | None = number(0.2, "the ratio of the probabilities is clipped at 1 +- this; null: not", above=0)
+    value_clip: float | None = number(None, "values are held within this of the rollout's; null: not", above=0)
+    max_kl: float | None = number(None, "steps end at this KL divergence from the rollout's policy; null: not", above=0)
 
 
 @dataclass(frozen=True)
@@ -72,12 +86,12 @@ class Reinforce(Learning):
 class Online(Common):
     """Per-step actor-critic: after every step, plain steps along eligibility traces."""
 
-    lambda_actor: float = option(
+    lambda_actor: float = number(
         0.9, "decay of the actor's trace; 0 is the gradient of the step alone", at_least=0, at_most=1
     )
-    lambda_critic: float = option(0.9, "decay of the critic's trace", at_least=0, at_most=1)
-    actor_lr: float = option(0.001, "step size of the actor", above=0)
-    critic_lr: float = option(0.005, "step size of the critic", above=0)
+    lambda_critic: float = number(0.9, "decay of the critic's trace", at_least=0, at_most=1)
+    actor_lr: float = number(0.001, "step size of the actor", above=0)
+    critic_lr: float = number(0.005, "step size of the critic", above=0)
     discounted: bool = option(False, "the actor's gradient times gamma^t")
 
 
@@ -85,7 +99,7 @@ class Online(Common):
 class Gaussian:
     """Options of the Gaussian policy that all networks share."""
 
-    sigma: float = option(0.5, "standard deviation of the policy at the beginning, before tanh", above=0)
+    sigma: float = number(0.5, "standard deviation of the policy at the beginning, before tanh", above=0)
     sigma_is: str = option(
         "learned", "how it goes on: a parameter, a schedule, a function of the state", choices=SIGMAS
     )
@@ -95,10 +109,12 @@ class Gaussian:
 
 @dataclass(frozen=True)
 class MLP(Gaussian):
-    """Separate multilayer perceptrons for actor and critic."""
+    """Separate multilayer perceptrons for actor and critic, of fixed features of the observation."""
 
     widths: list[int] = option([64, 64], "hidden units by layer", at_least=1)
     activation: str = option("tanh", "activation of the hidden layers", choices=tuple(ACTIVATIONS))
+    features: str = option("identity", "what the first layer sees", choices=tuple(FEATURES))
+    order: int = option(2, "degree, highest frequency, or grid points of an axis", at_least=1)
 
 
 @dataclass(frozen=True)
@@ -114,7 +130,10 @@ class Run:
     """Options of the run itself."""
 
     seed: int = option(0, "random seed", at_least=0, at_most=2**32 - 1)
-    num_seeds: int = option(1, "agents trained at once, with seeds seed, seed + 1, ...", at_least=1)
+    num_seeds: int = option(
+        1, "agents trained at once (of each setting of a sweep), with seeds seed, seed + 1, ...", at_least=1
+    )
+    vmap_seeds: int = option(1, "of all agents in one program; on a CPU programs of one agent are faster", at_least=1)
     num_envs: int = option(64, "environments of each agent", at_least=1)
     num_steps: int | None = option(None, "steps of a rollout (td); reinforce plays whole episodes", at_least=1)
     total_steps: int = option(1_000_000, "environment steps to train for, of each agent", at_least=1)
@@ -135,6 +154,14 @@ GROUPS: dict[str, dict[str, type]] = {
 }
 
 
+def option_fields(choices: Mapping[str, str]) -> dict[str, dataclasses.Field]:
+    """Every option under these choices, by its name on the command line."""
+    fields = {field.name: field for field in dataclasses.fields(Run)}
+    for group, choice in choices.items():
+        fields |= {f"{group}.{field.name}": field for field in dataclasses.fields(GROUPS[group][choice])}
+    return fields
+
+
 @dataclass(frozen=True)
 class EvaluateOptions:
     """Options of the evaluation; options of the environment may be given too, as env.NAME=VALUE."""
@@ -149,3 +176,11 @@ class EvaluateOptions:
     agent: int | None = option(None, "which of several agents, from 0 [default: the best]", at_least=0)
     cache: bool = option(True, "keep the compiled program in the user's cache folder, for the next evaluation")
     json: bool = option(False, "end with one line of JSON: mean, stderr, episodes, success")
+
+
+@dataclass(frozen=True)
+class InspectOptions:
+    """Options of the inspection."""
+
+    run: str | None = option(None, "run folder; required")
+    json: bool = option(False, "print one line of JSON: step, steps, finished, owner, digest, checkpoints")

@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
+import dataclasses
 import importlib
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Iterable, Mapping
 from typing import Any, NamedTuple
 
 import numpy as np
 
+from jaxpg.run import agents, figures, folder, lock, results
 from jaxpg.run import config as configuration
-from jaxpg.run import figures, folder
 from jaxpg.run.cache import compilation_cache
 from jaxpg.run.config import Config
 from jaxpg.run.errors import UserError
@@ -29,6 +30,7 @@ RESUMABLE = (
     *("total_steps", "log_interval", "eval_interval", "checkpoint_interval"),
     *("stop_return", "stop_agents", "cache"),
 )
+NOT_SAVED = 5  # the exit status of a run whose last state is on no disk
 
 
 class Session(NamedTuple):
@@ -40,17 +42,30 @@ class Session(NamedTuple):
     display: Display
 
 
-def begin(config: Config) -> int:
-    """Trains from the beginning; returns the exit status."""
+def begin(config: Config, check: Callable[[RunFolder], None] = folder.check_empty) -> int:
+    """Trains from the beginning; returns the exit status.
+
+    Args:
+      config: of the run.
+      check: raises UserError where the folder holds what must not be overwritten.
+    """
     prepare(config)
     env = make_env(config)  # before anything is written: it may have a mistake to report
-    run_folder, schedule = folder.create(config), plan(config)
-    configuration.save(config, run_folder.config)
+    run_folder = folder.planned(config)
+    lock.check_free(run_folder.path)
+    check(run_folder)
+    with folder.owned(run_folder, print):
+        check(run_folder)  # another process may have been there just now
+        return _begin(config, env, run_folder)
+
+
+def _begin(config: Config, env: Any, run_folder: RunFolder) -> int:
+    schedule, run = plan(config), config.run
+    folder.write_versions(run_folder)
+    folder.replace(run_folder.config, configuration.to_yaml(config))
     display = Display(schedule.total_steps)
-    run, algo = config.run, config.choices["algo"]
-    agents = f"seeds {run.seed} to {run.seed + run.num_seeds - 1}" if run.num_seeds > 1 else f"seed {run.seed}"
     display.say(
-        f"{algo} on {config.choices['env']}, {agents}: {run.num_envs} environments x {run.num_steps} steps x "
+        f"{agents.described(config)}: {run.num_envs} environments x {run.num_steps} steps x "
         f"{schedule.num_updates:,} updates = {schedule.total_steps:,} steps, into {run_folder.path}"
     )
     session = Session(config, schedule, run_folder, display)
@@ -60,24 +75,55 @@ def begin(config: Config) -> int:
 
 def resume(given: Mapping[str, Any]) -> int:
     """Goes on from the newest checkpoint of the run in `given["resume"]`; returns the exit status."""
-    from jaxpg.run.checkpoint import Checkpoints
-
     changes = {name: value for name, value in given.items() if name != "resume"}
     run_folder = folder.find(str(given["resume"]))
-    config = _changed(run_folder, changes)
+    with folder.owned(run_folder, print):
+        stored = configuration.load(run_folder.config)
+        config = configuration.change(stored, changes)
+        _check_same_run(run_folder, stored, config, changes)
+        return _go_on(config, run_folder)
+
+
+def begin_or_resume(config: Config) -> int:
+    """Goes on with the run in `run_dir` where there is something to resume, and else begins it; the exit status.
+
+    Args:
+      config: all options of the run, as for a new one.
+    """
+    if config.run.run_dir is None:
+        raise UserError("resume=auto needs run_dir=DIR: the folder to begin in, or to resume from")
+    run_folder = folder.planned(config)
+    if not folder.has_checkpoints(run_folder):
+        return begin(config, folder.check_nothing_to_lose)
+    with folder.owned(run_folder, print):
+        stored = configuration.load(run_folder.config)
+        # The folder may have been moved, or be given in other words.
+        config = dataclasses.replace(config, run=dataclasses.replace(config.run, run_dir=stored.run.run_dir))
+        _check_same_run(run_folder, stored, config, _named(stored) | _named(config))
+        return _go_on(config, run_folder)
+
+
+def _go_on(config: Config, run_folder: RunFolder) -> int:
+    from jaxpg.run.checkpoint import Checkpoints
+
     checkpoints = Checkpoints(run_folder.checkpoints)
-    update = checkpoints.latest()
-    if update is None:
-        raise UserError(f"{run_folder.path} has no checkpoint yet: start again with another run_dir")
+    if checkpoints.latest() is None:
+        raise UserError(
+            f"{run_folder.path} has no checkpoint yet: begin again in another run_dir, or here with resume=auto"
+        )
+    update, problems = checkpoints.newest_sound()
     recorded = folder.read_versions(run_folder)
     prepare(config, recorded.get("threads"))
     schedule = plan(config, done=update)
     display = Display(schedule.total_steps, steps=update * schedule.steps_per_update)
+    for problem in problems:
+        display.say(f"note: {problem}; the one before it is used")
+    session = Session(config, schedule, run_folder, display)
     if update >= schedule.num_updates:
-        _draw(config, run_folder)
+        _draw(session)
         display.say(f"{run_folder.path} is finished; a larger total_steps goes on")
         return 0
-    if _solved(config.run, _best_returns(folder.read_metrics(run_folder))):
+    if is_solved(config.run, results.best_returns(folder.read_metrics(run_folder))):
         display.say(f"{run_folder.path} has reached stop_return={config.run.stop_return:g}; a higher one goes on")
         return 0
     display.say(
@@ -86,25 +132,26 @@ def resume(given: Mapping[str, Any]) -> int:
     for name, now in folder.versions().items():
         if recorded.get(name) != now:
             display.say(f"note: {name} was {recorded.get(name)} and is {now}: the same run, but not the same bits")
-    session = Session(config, schedule, run_folder, display)
     program, seconds = _compile(session, make_env(config), resumed=True)
     state = checkpoints.restore(update, program.state_shape)
-    configuration.save(config, run_folder.config)
+    folder.replace(run_folder.config, configuration.to_yaml(config))
     return _train(session, program, state, seconds)
 
 
-def _changed(run_folder: RunFolder, changes: Mapping[str, Any]) -> Config:
-    """The stored configuration with the changes, if these leave it the same run."""
-    stored = configuration.load(run_folder.config)
-    changed = configuration.change(stored, changes)
-    before, after = configuration.flatten(stored), configuration.flatten(changed)
-    for name in changes:
+def _named(config: Config) -> dict[str, Any]:
+    """Everything that the command line can say, by its name there."""
+    return {**config.choices, **configuration.flatten(config)}
+
+
+def _check_same_run(run_folder: RunFolder, stored: Config, config: Config, names: Iterable[str]) -> None:
+    """Raises UserError where one of these options has changed that would make it another run."""
+    before, after = _named(stored), _named(config)
+    for name in names:
         if name not in RESUMABLE and before.get(name) != after.get(name):
+            given, has = (f"{name}={values[name]}" if name in values else f"no {name}" for values in (after, before))
             raise UserError(
-                f"{name}={changes[name]}: {run_folder.path} has {name}={before[name]}, and on resume only "
-                f"{', '.join(RESUMABLE)} may change"
+                f"{given}: {run_folder.path} has {has}, and on resume only {', '.join(RESUMABLE)} may change"
             )
-    return changed
 
 
 def _compile(session: Session, env: Any, resumed: bool = False) -> tuple[Program, float]:
@@ -112,7 +159,9 @@ def _compile(session: Session, env: Any, resumed: bool = False) -> tuple[Program
     session.display.say("compiling ...")
     began = time.monotonic()
     with compilation_cache(session.config.run.cache, session.display.say):
-        program = compile_program(session.config, env, session.schedule.chunk, resumed, meanwhile=_import_the_rest)
+        program = compile_program(
+            session.config, env, session.schedule.chunk, resumed=resumed, meanwhile=_import_the_rest
+        )
     seconds = time.monotonic() - began
     session.display.say(f"compiled in {seconds:.1f} s")
     return program, seconds
@@ -126,9 +175,10 @@ def _import_the_rest() -> None:
 def _train(session: Session, program: Program, state: RunState, compile_seconds: float) -> int:
     """Chunk after chunk until the last update or a request to stop; returns the exit status."""
     config, schedule, run_folder, display = session
-    keeper, solved = _Keeper(run_folder, config), False
+    solved = False
     first = update = _update(state.train)
-    log = MetricsLog(run_folder, update)
+    log = MetricsLog(run_folder, update, display.say)
+    keeper = _Keeper(session, log)
     began, seconds_before = time.monotonic(), log.seconds
     display.start()
     try:
@@ -141,25 +191,41 @@ def _train(session: Session, program: Program, state: RunState, compile_seconds:
                 if schedule.is_due(update, schedule.eval_every):
                     state, evaluation = _evaluate(program, state)
                     line |= evaluation
-                    solved = _solved(config.run, state.best.episode_return)
+                    solved = is_solved(config.run, state.best.episode_return)
                 line["seconds"] = round(seconds_before + time.monotonic() - began, 3)
                 log.write(line)
                 display.update(line)
-                if schedule.is_due(update, schedule.checkpoint_every) or solved or stop.signal:
+                if schedule.is_due(update, schedule.checkpoint_every) or keeper.failed:
                     keeper.save(update, state)
+            if update > first and keeper.saved != update:
+                keeper.save(update, state)
     finally:
         display.stop()
         log.close()
+    steps = f"{update * schedule.steps_per_update:,} steps"
+    if keeper.failed:
+        display.say(
+            f"error: the last state, at {steps}, could not be saved; resume={run_folder.path} repeats what is lost"
+        )
+        return NOT_SAVED
     if solved:
-        display.say(f"reached stop_return={config.run.stop_return:g} after {line['steps']:,} steps")
+        display.say(f"reached stop_return={config.run.stop_return:g} after {steps}")
     elif update < schedule.num_updates:
-        display.say(f"{stop.signal.name}: stopped at {line['steps']:,} steps; resume={run_folder.path} goes on")
+        display.say(f"{stop.signal.name}: stopped at {steps}; resume={run_folder.path} goes on")
         return 128 + stop.signal
     training_seconds = time.monotonic() - began
-    rate = (update - first) * schedule.steps_per_update * config.run.num_seeds / training_seconds
-    lines = _draw(config, run_folder)
-    display.table(_closing_rows(lines, run_folder, rate, compile_seconds, training_seconds))
+    rate = (update - first) * schedule.steps_per_update * config.num_agents / training_seconds
+    _show_results(session, rate, compile_seconds, training_seconds)
     return 0
+
+
+def _show_results(session: Session, rate: float, compile_seconds: float, training_seconds: float) -> None:
+    """The learning curve, the settings of a sweep and the table at the end."""
+    config, display, lines = session.config, session.display, _draw(session)
+    if config.sweep:
+        display.say(results.heading(config))
+        display.table(results.table(config, lines))
+    display.table(_closing_rows(lines, session.run_folder, rate, compile_seconds, training_seconds))
 
 
 def _update(train: TrainState) -> int:
@@ -167,27 +233,66 @@ def _update(train: TrainState) -> int:
     return int(np.asarray(train.update)[0])
 
 
-def _draw(config: Config, run_folder: RunFolder) -> list[dict[str, Any]]:
-    """Draws the learning curve; returns the lines of metrics that it shows."""
-    lines = folder.read_metrics(run_folder)
-    title = f"{config.choices['algo']} on {config.choices['env']}"
-    figures.learning_curve(lines, run_folder.learning_curve, title)
+def _draw(session: Session) -> list[dict[str, Any]]:
+    """Draws the learning curve, if it can be written; returns the lines of metrics that it shows."""
+    config, run_folder = session.config, session.run_folder
+    lines, title = folder.read_metrics(run_folder), agents.described(config)
+    try:
+        if config.sweep:
+            figures.sweep_curves(lines, run_folder.learning_curve, title, results.curves(config, lines))
+        else:
+            figures.learning_curve(lines, run_folder.learning_curve, title)
+    except OSError as error:
+        session.display.say(f"note: {run_folder.learning_curve}: cannot be written ({error.strerror})")
     return lines
 
 
 class _Keeper:
-    """Writes the run's state to `checkpoints/` and its best policy to `best/`."""
+    """Writes the run's state to `checkpoints/` and its best policy to `best/`, or says that it could not.
 
-    def __init__(self, run_folder: RunFolder, config: Config):
+    Attributes:
+      saved: the last update whose state, best policy and lines of metrics this process has saved; None before.
+      failed: whether the last save has failed.
+    """
+
+    def __init__(self, session: Session, log: MetricsLog):
         from jaxpg.run.checkpoint import Checkpoints
 
-        self._checkpoints = Checkpoints(run_folder.checkpoints)
-        self._best = Checkpoints(run_folder.best, keep=1)
-        self._meta = {"config": config.to_dict()}
+        self._checkpoints = Checkpoints(session.run_folder.checkpoints)
+        self._best = Checkpoints(session.run_folder.best, keep=1)
+        self._meta = {"config": session.config.to_dict()}
+        self._log, self._say = log, session.display.say
+        self._last: int | None = None  # the newest checkpoint of this process
+        self.saved: int | None = None
+        self.failed = False
 
     def save(self, update: int, state: RunState) -> None:
-        self._checkpoints.save(update, state, self._meta)
-        self._best.replace(update, state.best, self._meta)
+        """Saves the state after `update` updates; the first of several failures is said, and the end of them."""
+        problem = self._problem(update, state)
+        if problem and not self.failed:
+            self._say(f"note: {problem}; training goes on, and saving is tried again at each line of metrics")
+        elif self.failed and not problem:
+            self._say(f"note: saved again, after {update:,} updates")
+        self.failed = problem is not None
+        if not problem:
+            self.saved = update
+
+    def _problem(self, update: int, state: RunState) -> str | None:
+        """Saves; what has kept it from that."""
+        from jaxpg.run.checkpoint import SaveError
+
+        try:
+            self._log.flush()  # first: a checkpoint whose lines are not there would be resumed with a gap
+            if self._last != update:  # else only the best policy is missing
+                self._checkpoints.replace(update, state, self._meta)  # damaged ones may be newer than what was resumed
+                self._last = update
+            self._best.replace(update, state.best, self._meta)
+        except SaveError as error:
+            return str(error)
+        except OSError as error:
+            where = self._checkpoints.folder / str(update)
+            return f"{where}: not written without its lines of metrics, which cannot be ({error.strerror})"
+        return None
 
 
 def _summary(metrics: Metrics) -> dict[str, Any]:
@@ -204,12 +309,12 @@ def _evaluate(program: Program, state: RunState) -> tuple[RunState, dict[str, An
     policy = current_policy(state.train)
     episodes = program.evaluate(policy)
     values = {"return": episodes.episode_return} | episodes.metrics
-    results = {name: np.asarray(value, np.float64).mean(axis=-1) for name, value in values.items()}
-    best = better(state.best, Best(policy, results["return"].astype(np.float32)))
-    return state._replace(best=best), {f"eval_{name}": jsonable(value) for name, value in results.items()}
+    means = {name: np.asarray(value, np.float64).mean(axis=-1) for name, value in values.items()}
+    best = better(state.best, Best(policy, means["return"].astype(np.float32)))
+    return state._replace(best=best), {f"eval_{name}": jsonable(value) for name, value in means.items()}
 
 
-def _solved(run: Run, best_returns: np.ndarray) -> bool:
+def is_solved(run: Run, best_returns: np.ndarray) -> bool:
     """Whether all agents, or one of them, have reached the return at which the run ends."""
     if run.stop_return is None:
         return False
@@ -217,18 +322,12 @@ def _solved(run: Run, best_returns: np.ndarray) -> bool:
     return bool(reached.all() if run.stop_agents == "all" else reached.any())
 
 
-def _best_returns(lines: list[dict[str, Any]]) -> np.ndarray:
-    """The best evaluation of each agent, `[S]`."""
-    evaluations = [line for line in lines if "eval_return" in line]
-    return figures.series(evaluations, "eval_return")[1].max(axis=1, initial=-np.inf)
-
-
 def _closing_rows(
     lines: list[dict[str, Any]], run_folder: RunFolder, rate: float, compile_seconds: float, training_seconds: float
 ) -> dict[str, str]:
     evaluations = [line for line in lines if "eval_return" in line]
     last = evaluations[-1]
-    best = _best_returns(lines).tolist()
+    best = jsonable(results.best_returns(lines))
     rows = {"deterministic return": f"{shown(last['eval_return'])} at the end, {shown(best)} at best"}
     if "eval_success" in last:
         success = np.mean(last["eval_success"])

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -50,6 +50,11 @@ def start(train: TrainState) -> RunState:
 
 def current_policy(train: TrainState) -> Policy:
     return Policy(train.params, train.normalizer)
+
+
+def is_key(leaf: Any) -> bool:
+    """Whether an array holds random keys, which numpy does not know."""
+    return jax.dtypes.issubdtype(leaf.dtype, jax.dtypes.prng_key)
 
 
 def better(old: Best, new: Best) -> Best:

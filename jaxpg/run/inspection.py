@@ -1,0 +1,120 @@
+"""What can be said of a run folder without running anything."""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+from jaxpg.run import agents, folder, lock
+from jaxpg.run import config as configuration
+from jaxpg.run.checkpoint import CheckpointError, Checkpoints
+from jaxpg.run.config import Config
+from jaxpg.run.folder import RunFolder, jsonable
+from jaxpg.run.program import Schedule, plan
+from jaxpg.run.results import best_returns, table
+from jaxpg.run.session import is_solved
+from jaxpg.run.terminal import shown
+
+
+class Inspection(NamedTuple):
+    """A run as its folder shows it.
+
+    Attributes:
+      run_folder, config: of the run.
+      checkpoints: the problem of each checkpoint by its number, None where it is sound; the newest first.
+      update: of the newest sound checkpoint; 0 where there is none.
+      schedule: of the run that goes on from there.
+      finished: whether nothing is left to do.
+      owner: the process that is training in it just now, such as "process 12 on atlas"; None where there is none.
+      digest: of the state in the newest sound checkpoint; two runs are at the same point, bit for bit, where it is the
+        same. None where there is none.
+      lines: of metrics.
+      changed: name -> (what it was when the run began, what it is now), of versions and machine.
+    """
+
+    run_folder: RunFolder
+    config: Config
+    checkpoints: dict[int, str | None]
+    update: int
+    schedule: Schedule
+    finished: bool
+    owner: str | None
+    digest: str | None
+    lines: list[dict[str, Any]]
+    changed: dict[str, tuple[Any, Any]]
+
+
+def inspect(path: str) -> Inspection:
+    """Looks at the run in the folder `path`.
+
+    Raises:
+      UserError: it is no run folder, or its configuration or versions cannot be read.
+    """
+    run_folder = folder.find(path)
+    config, lines = configuration.load(run_folder.config), folder.read_metrics(run_folder)
+    stored = Checkpoints(run_folder.checkpoints, read_only=True)
+    checkpoints = {number: _problem(stored, number) for number in stored.numbers()}
+    sound = [number for number, problem in checkpoints.items() if problem is None]
+    update = sound[0] if sound else 0
+    schedule = plan(config, done=update)
+    before, now = folder.read_versions(run_folder), folder.versions()
+    return Inspection(
+        run_folder=run_folder,
+        config=config,
+        checkpoints=checkpoints,
+        update=update,
+        schedule=schedule,
+        finished=bool(sound) and (update >= schedule.num_updates or is_solved(config.run, best_returns(lines))),
+        owner=lock.owner(run_folder.path),
+        digest=stored.digest(update) if sound else None,
+        lines=lines,
+        changed={name: (before.get(name), value) for name, value in now.items() if before.get(name) != value},
+    )
+
+
+def _problem(checkpoints: Checkpoints, number: int) -> str | None:
+    try:
+        checkpoints.read(number)
+    except CheckpointError as error:
+        return str(error)
+    return None
+
+
+def summary(found: Inspection) -> dict[str, Any]:
+    """The inspection as plain values: `step` counts updates, as checkpoints do, and `steps` environment steps."""
+    return {
+        "step": found.update,
+        "steps": found.update * found.schedule.steps_per_update,
+        "finished": found.finished,
+        "owner": found.owner,
+        "digest": found.digest,
+        "checkpoints": [{"step": number, "sound": problem is None} for number, problem in found.checkpoints.items()],
+    }
+
+
+def described(found: Inspection) -> str:
+    """The inspection in words, a line for each thing."""
+    config, schedule = found.config, found.schedule
+    done, total = found.update * schedule.steps_per_update, schedule.total_steps
+    rows = {
+        "run": agents.described(config),
+        "progress": f"{done:,} of {total:,} steps, " + ("finished" if found.finished else "not finished"),
+        "checkpoints": ", ".join(
+            f"{number} {'sound' if problem is None else 'damaged'}" for number, problem in found.checkpoints.items()
+        )
+        or "none",
+    }
+    if found.owner:
+        rows["training"] = f"just now, by {found.owner}"
+    evaluations = [line["eval_return"] for line in found.lines if "eval_return" in line]
+    if evaluations:
+        best = jsonable(best_returns(found.lines))
+        rows["return"] = f"{shown(evaluations[-1])} at the last evaluation, {shown(best)} at best"
+        if config.sweep:
+            setting, score = next(iter(table(config, found.lines).items()))
+            rows["best setting"] = f"{setting}: {score}"
+    rows["versions"] = "as they are now"
+    if found.changed:
+        rows["versions"] = ", ".join(f"{name} was {was} and is {now}" for name, (was, now) in found.changed.items())
+    rows["digest"] = found.digest or "none"
+    problems = [f"damaged: {problem}" for problem in found.checkpoints.values() if problem]
+    return "\n".join([f"{name:<12} {value}" for name, value in rows.items()] + problems)

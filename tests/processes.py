@@ -1,0 +1,80 @@
+"""Training processes that tests stop in the middle of a cheap run, and the disks that these write to."""
+
+import contextlib
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+
+import pytest
+
+from jaxpg.run.checkpoint import Checkpoints
+
+LINES = 100  # of metrics; a checkpoint after every tenth
+SIZES = ("env=quadratic", "network=linear", "num_envs=2", "num_steps=4", "log_interval=16", "eval_interval=32")
+RUN = (*SIZES, "eval_episodes=2", "env.episode_length=8", "checkpoint_interval=160", f"total_steps={16 * LINES}")
+
+
+@contextlib.contextmanager
+def training(environment, *arguments):
+    """A training process; its output comes line by line, without a buffer."""
+    command = [sys.executable, "-m", "jaxpg.train", *arguments]
+    environment = environment | {"PYTHONUNBUFFERED": "1"}
+    pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.STDOUT, "text": True}
+    with subprocess.Popen(command, env=environment, **pipes) as process:
+        try:
+            yield process
+        finally:
+            process.kill()
+
+
+def stop_after(process, folder, lines):
+    """Stops the process when it has written so many lines of metrics; `proceed` lets it go on."""
+    log, deadline = folder / "metrics.jsonl", time.monotonic() + 300
+    while not (log.exists() and log.read_text().count("\n") >= lines):
+        assert process.poll() is None, process.stdout.read()
+        assert time.monotonic() < deadline
+        time.sleep(0.002)
+    process.send_signal(signal.SIGSTOP)
+    os.waitid(os.P_PID, process.pid, os.WSTOPPED | os.WNOWAIT)
+
+
+def proceed(process):
+    process.send_signal(signal.SIGCONT)
+
+
+def output_until(process, *texts):
+    """What the process says until each of the texts has been said."""
+    said = ""
+    for line in process.stdout:
+        said += line
+        if all(text in said for text in texts):
+            return said
+    raise AssertionError(said)
+
+
+def outcome(folder):
+    """The lines of metrics without their times, and the newest checkpoint's number and digest."""
+    lines = [json.loads(line) for line in (folder / "metrics.jsonl").read_text().splitlines()]
+    checkpoints = Checkpoints(folder / "checkpoints", read_only=True)
+    latest = checkpoints.newest_sound()[0]
+    return [{**line, "seconds": None} for line in lines], latest, checkpoints.digest(latest)
+
+
+def tree(folder):
+    """All files below a folder with their contents."""
+    return {path.relative_to(folder): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+
+
+@contextlib.contextmanager
+def mounted(*arguments):
+    """`mount *arguments`, the last of which is the folder; skips the test where that is not possible."""
+    result = subprocess.run(["mount", *map(str, arguments)], capture_output=True, text=True, check=False)
+    if result.returncode:
+        pytest.skip(f"cannot mount here: {result.stderr.strip()}")
+    try:
+        yield arguments[-1]
+    finally:
+        subprocess.run(["umount", "--lazy", str(arguments[-1])], check=True)

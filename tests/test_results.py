@@ -1,0 +1,75 @@
+"""What is said of a sweep's settings at the end."""
+
+import numpy as np
+import pytest
+
+from jaxpg.run.config import compose
+from jaxpg.run.figures import sweep_curves
+from jaxpg.run.results import DRAWN, SHOWN, best_returns, curves, heading, ranking, table
+from jaxpg.run.statistics import bootstrap_interval, interquartile_mean
+
+CONFIG = compose(["num_seeds=4", "sweep.algo.gamma=[0.5,0.75,1]"])
+FIRST = [1.0, 2.0, 3.0, None, 7.0, 5.0, 6.0, 8.0, 0.0, 0.0, 0.0, 0.0]
+LAST = [1.0, 1.5, 2.0, 3.0, None, 8.0, 8.0, 8.0, 2.0, 2.5, 3.0, 100.0]
+LINES = [
+    {"steps": 10, "eval_return": FIRST},
+    {"steps": 15, "return": FIRST},
+    {"steps": 20, "eval_return": LAST},
+]
+
+
+def test_settings_are_in_order_of_the_interquartile_mean_of_the_last_evaluation():
+    """That with a seed that diverged is the last, however good the others are."""
+    rows = table(CONFIG, LINES)
+    assert list(rows) == ["algo.gamma=1.0", "algo.gamma=0.5", "algo.gamma=0.75"]
+    low, high = bootstrap_interval(np.array(LAST[8:]))
+    assert rows["algo.gamma=1.0"] == f"{interquartile_mean(np.array(LAST[8:])):.1f} [{low:.1f}, {high:.1f}]"
+    assert rows["algo.gamma=0.75"] == "n/a"
+    assert "interquartile mean of 4 seeds" in heading(CONFIG)
+
+
+def test_a_setting_with_one_seed_has_no_interval():
+    config = compose(["seed=3", "sweep.algo.gamma=[0.5,0.75]"])
+    assert table(config, [{"eval_return": [-3.25, 1.0]}]) == {"algo.gamma=0.75": "1.0", "algo.gamma=0.5": "-3.2"}
+    assert "return of the last evaluation, seed 3:" in heading(config)
+
+
+def test_of_many_settings_the_best_are_shown():
+    number = SHOWN + 5
+    config = compose(["sweep.algo.gamma=[" + ",".join(f"{i / 100}" for i in range(number)) + "]"])
+    lines = [{"eval_return": np.random.default_rng(0).permutation(number).astype(float).tolist()}]
+    rows = table(config, lines)
+    assert [float(value) for value in rows.values()] == list(range(number - 1, 4, -1))
+    assert heading(config).startswith(f"the best {SHOWN} of {number} settings")
+    assert list(curves(config, lines)) == list(rows)[:DRAWN]
+
+
+def test_a_curve_has_the_agents_of_its_setting():
+    for name, agents in curves(CONFIG, LINES).items():
+        setting = ["algo.gamma=0.5", "algo.gamma=0.75", "algo.gamma=1.0"].index(name)
+        assert range(12)[agents] == range(4 * setting, 4 * setting + 4)
+
+
+def test_the_best_evaluation_of_an_agent_is_that_of_those_with_a_number():
+    assert best_returns(LINES).tolist() == [1, 2, 3, 3, 7, 8, 8, 8, 2, 2.5, 3, 100]
+    assert best_returns([{"eval_return": None}, {"eval_return": -2.0}]).tolist() == [-2]
+    assert best_returns([]).tolist() == [-np.inf]
+
+
+def test_before_the_first_evaluation_nothing_is_known():
+    assert set(table(CONFIG, LINES[1:2]).values()) == {"n/a"}
+
+
+def test_settings_that_differ_in_the_last_digit_are_two():
+    config = compose(["sweep.algo.gamma=[0.99999990,0.99999991]"])
+    assert list(table(config, [{"eval_return": [1.0, 2.0]}])) == ["algo.gamma=0.99999991", "algo.gamma=0.9999999"]
+
+
+def test_equal_settings_keep_their_order():
+    assert ranking(np.array([[1.0], [2.0], [1.0], [2.0]])).tolist() == [1, 3, 0, 2]
+
+
+@pytest.mark.parametrize("lines", [LINES, [line | {"eval_success": [0.5] * 12} for line in LINES]])
+def test_a_sweep_is_drawn_where_a_setting_has_diverged(lines, tmp_path):
+    sweep_curves(lines, tmp_path / "curves.png", "title", curves(CONFIG, lines))
+    assert (tmp_path / "curves.png").read_bytes().startswith(b"\x89PNG")
