@@ -24,14 +24,14 @@ def test_commands_run(command, tmp_path):
         line for block in blocks("bash") for line in block.splitlines() if line.startswith(".venv/bin/python -m jaxpg")
     ]
     assert len(lines) == 8
-    tiny = ["num_envs=2", "num_steps=2", "total_steps=4", "eval_episodes=2"]
+    tiny = ["num_envs=2", "num_steps=2", "eval_episodes=2"]
     for line in lines:
         _, _, module, *arguments = shlex.split(line)
         arguments = [re.sub(r"=runs/", f"={tmp_path}/", argument) for argument in arguments]
-        if "resume=" in line:
-            arguments = [re.sub(r"total_steps=.*", "total_steps=8", argument) for argument in arguments]
-        elif "train" in module:
-            arguments += tiny
+        if "train" in module:
+            arguments = [argument for argument in arguments if not argument.startswith("total_steps=")]
+            arguments += [f"total_steps={8 if 'resume=' in line else 4}"]
+            arguments += [] if "resume=runs/" in line else tiny
         result = command(module.removeprefix("jaxpg."), *arguments)
         assert result.returncode == 0, (line, result.stderr)
 
