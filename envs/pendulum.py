@@ -40,7 +40,7 @@ TRAINING = {
     "ppo": {
         "num_envs": 512,
         "num_steps": 30,
-        "total_steps": 700_000,
+        "total_steps": 490_000,
         "log_interval": 50_000,
         "eval_interval": 50_000,
         "algo.minibatches": 8,

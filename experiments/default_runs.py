@@ -2,9 +2,11 @@
 
     python experiments/default_runs.py [pendulum] [arm]
 
-Pendulum: the default run for seeds 0 to 4, TD(lambda) and TD(0), each evaluated over 200 episodes of Gymnasium's own
-Pendulum-v1. Arm: the default run for seeds 0 to 2, and one run for each kind of control, plane and reward, each
-evaluated over 500 episodes. Writes results/default_runs_pendulum.json and results/default_runs_arm.json.
+Pendulum: the default run for seeds 0 to 9, TD(lambda) and TD(0) for seeds 0 to 4, each evaluated over 200 and over
+1,000 episodes of Gymnasium's own Pendulum-v1; from its first 200 starts the best possible mean return is -140.6, from
+its first 1,000 -135.7 (dynamic programming on a grid of angle and speed). Arm: the default run for seeds 0 to 2, and
+one run for each kind of control, plane and reward, each evaluated over 500 episodes. Writes
+results/default_runs_pendulum.json and results/default_runs_arm.json.
 """
 
 from __future__ import annotations
@@ -17,8 +19,7 @@ from pathlib import Path
 
 from commands import evaluate, train, write_json
 
-PENDULUM_SEEDS = range(5)
-PENDULUM_RUNS = {"default": (), "TD": ("algo=td",), "TD(0)": ("algo=td", "algo.lambda_=0")}
+PENDULUM_RUNS = {"default": ((), 10), "TD": (("algo=td",), 5), "TD(0)": (("algo=td", "algo.lambda_=0"), 5)}  # seeds
 ARM_RUNS = [{"seed": str(seed)} for seed in range(3)] + [
     {"env.control": control, "env.gravity": gravity, "env.reward": reward}
     for control, gravity, reward in itertools.product(("torque", "velocity"), ("false", "true"), ("lesson", "precise"))
@@ -28,12 +29,14 @@ ARM_RUNS = [{"seed": str(seed)} for seed in range(3)] + [
 
 def pendulum(folder: Path) -> None:
     rows = []
-    for name, options in PENDULUM_RUNS.items():
-        for seed in PENDULUM_SEEDS:
+    for name, (options, seeds) in PENDULUM_RUNS.items():
+        for seed in range(seeds):
             run = folder / f"pendulum-{name}-{seed}"
             seconds = train(run, "env=pendulum", f"seed={seed}", *options)
             found = evaluate(run, "episodes=200", "backend=gymnasium")
-            rows.append({"run": name, "seed": seed, "seconds": round(seconds, 1), **found})
+            more = evaluate(run, "episodes=1000", "backend=gymnasium")
+            row = {"run": name, "seed": seed, "seconds": round(seconds, 1), **found}
+            rows.append(row | {"mean_of_1000": more["mean"], "stderr_of_1000": more["stderr"]})
             print(rows[-1], flush=True)
     write_json("default_runs_pendulum.json", rows)
 

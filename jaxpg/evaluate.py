@@ -19,14 +19,15 @@ def main(arguments: Sequence[str]) -> int:
         print(help.run_help("evaluate", EvaluateOptions))
         return 0
     from jaxpg.run import episodes, policies
-    from jaxpg.run.cache import compilation_cache
+    from jaxpg.run.cache import compilation_cache, physics_cache
 
     given = config.parse(arguments)
     changes = {name: value for name, value in given.items() if name.startswith("env.")}
     options = build(EvaluateOptions, {name: value for name, value in given.items() if name not in changes})
     if options.run is None:
         raise UserError("run=DIR is missing: the folder of the run to evaluate")
-    stored = policies.load(options.run, options.checkpoint, options.agent, changes)
+    with physics_cache(options.cache):
+        stored = policies.load(options.run, options.checkpoint, options.agent, changes)
     play = episodes.play_gymnasium if options.backend == "gymnasium" else episodes.play_own
     with compilation_cache(options.cache, print):
         returns, metrics = play(stored, options.episodes, options.seed)

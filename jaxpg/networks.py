@@ -74,6 +74,7 @@ def orthogonal(gain: float) -> nn.initializers.Initializer:
     return init
 
 
+@jax.jit  # flax traces the initializers at every application, to compare shapes: this is traced once for each shape
 def _orthonormalize(a: jax.Array) -> jax.Array:
     """Orthonormal columns spanning the same spaces as the first 1, 2, ... columns of `a`, `[n, m]` with n >= m."""
 

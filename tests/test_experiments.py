@@ -42,8 +42,7 @@ def experiments(monkeypatch, command_environment, tmp_path):
 def test_default_runs(experiments, monkeypatch):
     import default_runs
 
-    monkeypatch.setattr(default_runs, "PENDULUM_SEEDS", range(1))
-    monkeypatch.setattr(default_runs, "PENDULUM_RUNS", {"default": ()})
+    monkeypatch.setattr(default_runs, "PENDULUM_RUNS", {"default": ((), 1)})
     monkeypatch.setattr(default_runs, "ARM_RUNS", default_runs.ARM_RUNS[-1:])
     monkeypatch.setattr(
         default_runs, "evaluate", lambda folder, *options: {"mean": -1.0, "stderr": 0.1, "success": 0.5}

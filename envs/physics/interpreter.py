@@ -78,7 +78,11 @@ class Program:
 
     def __len__(self):
         """The number of scalar equations."""
-        return len(in_order(self._computed()))
+        return len(self.equations())
+
+    def equations(self) -> list[Expression]:
+        """The scalar equations, operands first."""
+        return in_order(self._computed())
 
     def kernels(self) -> list[Stage]:
         """The stages in a few large pieces, each of them one kernel on a CPU."""

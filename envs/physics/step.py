@@ -19,6 +19,7 @@ from envs.physics.interpreter import Program, trace
 from envs.physics.models import import_mjx, model_name, put_model
 from envs.physics.rules import UnsupportedPrimitive
 from envs.physics.stages import Stage
+from envs.physics.storage import kept, name_of
 from envs.physics.tiles import in_tiles
 
 if TYPE_CHECKING:
@@ -70,16 +71,15 @@ def compile_step(
         raise ValueError(f"the model has {model.na} actuator activation states, which the inputs {inputs} do not carry")
     carried = tuple(name for name in inputs if name in STATE)
     results = carried + tuple(name for name in outputs if name not in carried)
-    once, example = single_step(model, inputs, results)
     if physics == "scalar":
         try:
-            program = trace(once, *example)
+            program = scalar_program(model, inputs, results)
             repeated = in_tiles(program, functools.partial(_program_step, program, inputs, carried, num_substeps))
         except UnsupportedPrimitive as error:
             logger.warning("%s: stepped by mjx.step, not as scalar equations: %s", model_name(model), error)
-            once, _ = single_step(_without_lapack(model), inputs, results)
-            physics = "mjx"
+            model, physics = _without_lapack(model), "mjx"
     if physics == "mjx":
+        once, _ = single_step(model, inputs, results)
 
         def repeated(*arrays):
             return _repeat(lambda values: once(*values), inputs, carried, num_substeps, arrays)
@@ -91,6 +91,19 @@ def compile_step(
         return tuple(values[name] for name in outputs)
 
     return step
+
+
+def scalar_program(model: mujoco.MjModel, inputs: tuple[str, ...], outputs: tuple[str, ...]) -> Program:
+    """One physics step as scalar equations, kept if `storage.kept_in` says where; UnsupportedPrimitive if it has none.
+
+    Where it is kept, MJX is not even imported.
+    """
+
+    def make():
+        step, example = single_step(model, inputs, outputs)
+        return trace(step, *example)
+
+    return kept(name_of(model, inputs, outputs), make)
 
 
 def single_step(model: mujoco.MjModel, inputs: tuple[str, ...], outputs: tuple[str, ...]) -> tuple[Callable, list]:

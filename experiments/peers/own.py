@@ -17,7 +17,7 @@ import jax  # noqa: E402
 
 sys.path.insert(0, str(Path(__file__).parents[2]))  # the repository, if it is not installed
 from jaxpg.actor_critic import deterministic_policy  # noqa: E402
-from jaxpg.run.cache import compilation_cache  # noqa: E402
+from jaxpg.run.cache import compilation_cache, physics_cache  # noqa: E402
 from jaxpg.run.config import compose  # noqa: E402
 from jaxpg.run.program import compile_program, make_env, make_networks, plan  # noqa: E402
 from jaxpg.run.runtime import prepare  # noqa: E402
@@ -29,7 +29,9 @@ RECORDERS = ("out", "budget", "started")
 def main() -> None:
     config = compose(["env=pendulum", *(f"{name}={value}" for name, value in OPTIONS.items() if name not in RECORDERS)])
     prepare(config)
-    env, schedule = make_env(config), plan(config)
+    with physics_cache(config.run.cache):
+        env = make_env(config)
+    schedule = plan(config)
     with compilation_cache(config.run.cache, print):
         program = compile_program(config, env, schedule.chunk)
     networks = make_networks(config, env)

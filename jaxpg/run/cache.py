@@ -7,6 +7,9 @@ verified; what jax adds is published in the store by renaming, which other proce
 
 The store is `jaxpg` in the user's cache folder (XDG_CACHE_HOME, else ~/.cache), with one folder for each jaxlib, CPU,
 XLA_FLAGS and number of threads: jax's own keys leave out the last one, and trust the CPU to be the same.
+
+The equations of the environments' physics (`envs.physics.storage`) are kept beside them, in `physics`. They are text,
+and the same on every machine.
 """
 
 from __future__ import annotations
@@ -29,12 +32,14 @@ import jax
 import jaxlib
 from jax.experimental.compilation_cache import compilation_cache as jax_cache
 
+from envs.physics import storage
 from jaxpg.run.folder import num_threads
 
 MAX_AGE = 30 * 24 * 3600.0  # seconds; an older entry is removed, and compiled anew when it is needed
 MAX_BYTES = 64 * 2**20  # of all entries together: every start reads those of its folder. A training takes half a MB.
 MAX_STAGING_AGE = 24 * 3600.0  # of the temporary folder of a process that was killed
 STAGING = "staging-"
+PHYSICS = "physics"
 REJECTED = "rejected"  # a file where the entries belong, on a machine that cannot load what it has compiled
 UNREADABLE = "Error reading persistent compilation cache entry"
 # XLA's words, on standard error, for a program that it takes for another machine's; some CPUs never know their own.
@@ -113,6 +118,64 @@ def _configure(settings: dict) -> None:
     jax_cache.reset_cache()  # jax looks at its settings once, at the first compilation
 
 
+@contextlib.contextmanager
+def physics_cache(enabled: bool) -> Iterator[None]:
+    """Equations of physics that are made inside come from the user's cache folder where they are there.
+
+    Where there can be no such folder they are made anew; that there is none is said where programs are compiled.
+
+    Args:
+      enabled: without it nothing is read or written.
+    """
+    texts = None
+    if enabled:
+        with contextlib.suppress(CacheError, OSError):
+            texts = Texts(cache_folder())
+    with storage.kept_in(texts):
+        yield
+
+
+class Texts:
+    """Texts by name, each in a file with its digest in its name; a damaged one is as if it were not there.
+
+    Raises:
+      CacheError: the folder is not the user's alone; OSError: there can be none.
+    """
+
+    def __init__(self, root: Path):
+        self.folder = root / PHYSICS
+        _make_private(root, self.folder)
+
+    def read(self, name: str) -> str | None:
+        for path in self.folder.glob(f"{name}.*"):
+            with contextlib.suppress(OSError):
+                content = path.read_bytes()
+                if path.name == f"{name}.{_digest(content)}":
+                    return content.decode()
+        return None
+
+    def write(self, name: str, text: str) -> None:
+        """Keeps the text instead of what was kept under its name; without a word where that is not possible."""
+        content = text.encode()
+        with (
+            contextlib.suppress(OSError),
+            tempfile.TemporaryDirectory(prefix=STAGING, dir=self.folder.parent) as folder,
+        ):
+            path = Path(folder) / f"{name}.{_digest(content)}"
+            path.write_bytes(content)
+            for damaged in self.folder.glob(f"{name}.*"):
+                damaged.unlink(missing_ok=True)
+            path.replace(self.folder / path.name)
+
+
+def _make_private(root: Path, folder: Path) -> None:
+    """Makes both where they are not there; raises CacheError unless they are the user's alone."""
+    root.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
+    for path in (root, folder):
+        path.mkdir(mode=0o700, exist_ok=True)
+        check_private(path)
+
+
 class Store:
     """The entries that belong to this jaxlib, CPU, XLA_FLAGS and number of threads.
 
@@ -129,10 +192,7 @@ class Store:
         self.root, self.folder = root, root / machine()
         self.loaded: set[str] = set()
         self.notes: list[str] = []
-        root.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
-        for folder in (root, self.folder):
-            folder.mkdir(mode=0o700, exist_ok=True)
-            check_private(folder)
+        _make_private(root, self.folder)
 
     def stage(self) -> tempfile.TemporaryDirectory:
         """A temporary folder with every entry that is intact; those that are not are removed."""
@@ -213,7 +273,7 @@ def check_private(folder: Path) -> None:
 def remove_old(root: Path, now: float | None = None) -> None:
     """Keeps the newest entries of all machines, up to `MAX_AGE` and `MAX_BYTES`; removes left temporary folders."""
     now, total = now or time.time(), 0
-    files = [(path, path.lstat()) for path in root.glob("jaxlib-*/*")]
+    files = [(path, path.lstat()) for kind in ("jaxlib-*", PHYSICS) for path in root.glob(f"{kind}/*")]
     for path, found in sorted(files, key=lambda file: file[1].st_mtime, reverse=True):
         total += found.st_size
         if total > MAX_BYTES or now - found.st_mtime > MAX_AGE:

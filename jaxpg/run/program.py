@@ -247,12 +247,13 @@ def compile_program(
 
     init, advance, play = (over_agents(fn, run.vmap_seeds) for fn in (init, advance, play))
     of_group = jax.tree.map(lambda x: x[: run.vmap_seeds], agents)
-    shape = jax.eval_shape(init, of_group)
+    init = jax.jit(init).trace(of_group)
+    shape = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype), init.out_info)
     with ThreadPoolExecutor() as pool:
         # Tracing holds Python's lock and compiling does not: one trace after the other, that of the longest compilation
         # first, so that no compilation waits for another one's trace.
         advance = pool.submit(jax.jit(advance).lower(of_group, shape.train).compile, OPTIMIZED)
-        init = None if resumed else pool.submit(jax.jit(init).lower(of_group).compile, RUN_ONCE)
+        init = None if resumed else pool.submit(init.lower().compile, RUN_ONCE)
         play = pool.submit(jax.jit(play).lower(current_policy(shape.train)).compile, OPTIMIZED)
         meanwhile()
     init, advance, play = (in_groups(fn.result(), run.vmap_seeds) if fn else None for fn in (init, advance, play))
@@ -260,7 +261,7 @@ def compile_program(
         functools.partial(init, agents) if init else None,
         functools.partial(advance, agents),
         play,
-        state_shape(make_algorithm(config, env), len(agents.seed)),
+        jax.tree.map(lambda x: jax.ShapeDtypeStruct((len(agents.seed), *x.shape[1:]), x.dtype), shape),
     )
 
 

@@ -12,7 +12,7 @@ import numpy as np
 
 from jaxpg.run import agents, figures, folder, lock, results
 from jaxpg.run import config as configuration
-from jaxpg.run.cache import compilation_cache
+from jaxpg.run.cache import compilation_cache, physics_cache
 from jaxpg.run.config import Config
 from jaxpg.run.errors import UserError
 from jaxpg.run.folder import MetricsLog, RunFolder, jsonable
@@ -50,7 +50,7 @@ def begin(config: Config, check: Callable[[RunFolder], None] = folder.check_empt
       check: raises UserError where the folder holds what must not be overwritten.
     """
     prepare(config)
-    env = make_env(config)  # before anything is written: it may have a mistake to report
+    env = _env(config)  # before anything is written: it may have a mistake to report
     run_folder = folder.planned(config)
     lock.check_free(run_folder.path)
     check(run_folder)
@@ -132,7 +132,7 @@ def _go_on(config: Config, run_folder: RunFolder) -> int:
     for name, now in folder.versions().items():
         if recorded.get(name) != now:
             display.say(f"note: {name} was {recorded.get(name)} and is {now}: the same run, but not the same bits")
-    program, seconds = _compile(session, make_env(config), resumed=True)
+    program, seconds = _compile(session, _env(config), resumed=True)
     state = checkpoints.restore(update, program.state_shape)
     folder.replace(run_folder.config, configuration.to_yaml(config))
     return _train(session, program, state, seconds)
@@ -152,6 +152,11 @@ def _check_same_run(run_folder: RunFolder, stored: Config, config: Config, names
             raise UserError(
                 f"{given}: {run_folder.path} has {has}, and on resume only {', '.join(RESUMABLE)} may change"
             )
+
+
+def _env(config: Config) -> Any:
+    with physics_cache(config.run.cache):
+        return make_env(config)
 
 
 def _compile(session: Session, env: Any, resumed: bool = False) -> tuple[Program, float]:
