@@ -22,13 +22,13 @@ from typing import Any
 from commands import write_json
 
 ARGUMENTS = ("env=pendulum",)
-# Phases by what is called in them: of `jaxpg.run.session`, of its `_Keeper`, or of the configuration.
+# Phases by what is called in them: of `jaxpg.run.session`, of its `Keeper`, or of the configuration.
 PHASES = {
     "options": ("configuration.compose",),
-    "environment": ("make_env",),
+    "environment": ("_env",),
     "tracing and compiling": ("_compile",),
     "evaluations": ("_evaluate",),
-    "checkpoints": ("_Keeper.__init__", "_Keeper.save"),
+    "checkpoints": ("Keeper.__init__", "Keeper.save"),
     "figure": ("_draw",),
 }
 TRACING = ("jaxpr_trace_duration", "jaxpr_to_mlir_module_duration")

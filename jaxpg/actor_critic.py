@@ -21,7 +21,7 @@ from jaxpg.networks import Networks
 from jaxpg.returns import discount_factors
 from jaxpg.rollout import PolicyFn, rollout
 from jaxpg.types import Algorithm, Metrics, PyTree, TrainState, Transition
-from jaxpg.vector_env import VectorEnv, VectorState, stagger
+from jaxpg.vector_env import VectorEnv, VectorState, divergence, stagger
 
 
 class Method(NamedTuple):
@@ -146,8 +146,8 @@ def actor_critic(
       normalize_advantages: mean 0 and standard deviation 1 over the rollout.
 
     Returns:
-      `Algorithm(init, step)`; metrics are scalars, of which `return_sum` and `episodes` are to be summed over updates
-      and the others averaged.
+      `Algorithm(init, step)`; metrics are scalars, of which `return_sum`, `episodes` and `diverged` are to be summed
+      over updates and the others averaged.
     """
     prepare = batch_of(networks, method, env.episode_length, reward_scale, normalize_advantages)
     loss = actor_critic_loss(networks, entropy_coef, reuse)
@@ -177,6 +177,7 @@ def actor_critic(
             "return_sum": jnp.sum(transition.episode_return),
             "episodes": jnp.sum(transition.episode_end),
         }
+        metrics |= divergence(transition)
         return TrainState(params, opt_state, normalizer, env_state, state.update + 1), metrics
 
     return Algorithm(init, step)

@@ -18,7 +18,7 @@ from jaxpg.returns import td_errors
 from jaxpg.rollout import rollout
 from jaxpg.shapes import along
 from jaxpg.types import Algorithm, Metrics, PyTree, TrainState, Transition
-from jaxpg.vector_env import VectorEnv, stagger
+from jaxpg.vector_env import VectorEnv, divergence, stagger
 
 
 class Traces(NamedTuple):
@@ -110,6 +110,7 @@ def online_actor_critic(
             "return_sum": jnp.sum(transition.episode_return),
             "episodes": jnp.sum(transition.episode_end),
         }
+        metrics |= divergence(transition)
         return TrainState(params, traces, normalizer, env_state, state.update + 1), metrics
 
     return Algorithm(init, step)

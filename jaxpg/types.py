@@ -23,6 +23,8 @@ class Transition(NamedTuple):
       next_obs: the true s_{t+1}, the one before any reset, `[T, N, observation_size]`.
       episode_end: 1.0 where a whole episode, played from its first step, ended with the step, `[T, N]`.
       episode_return: the undiscounted return of that episode, 0 where none ended, `[T, N]`.
+      diverged: 1.0 where the physics gave a number that is not finite, `[T, N]`; the step terminated, with reward 0 and
+        the observation before it as the true next one.
     """
 
     obs: jax.Array
@@ -33,6 +35,7 @@ class Transition(NamedTuple):
     next_obs: jax.Array
     episode_end: jax.Array
     episode_return: jax.Array
+    diverged: jax.Array
 
 
 class TrainState(NamedTuple):

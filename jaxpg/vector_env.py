@@ -3,6 +3,8 @@
 The environment is any object with brax's `reset(key) -> State` and `step(State, action) -> State`. Its `done` means
 termination; the time limit is added here, as truncation. An environment that ended is reset at once with a fresh draw,
 and the observation from *before* the reset is handed out as s_{t+1}, for the bootstrap.
+
+A physics that diverges, as stiff models do at long time steps, ends the episode of its environment and no other's.
 """
 
 from __future__ import annotations
@@ -14,6 +16,7 @@ import jax
 import jax.numpy as jnp
 
 from jaxpg.shapes import along
+from jaxpg.types import Metrics, Transition
 
 
 class VectorState(NamedTuple):
@@ -46,6 +49,7 @@ class Outcome(NamedTuple):
     next_obs: jax.Array
     episode_end: jax.Array
     episode_return: jax.Array
+    diverged: jax.Array
 
 
 class VectorEnv(NamedTuple):
@@ -81,15 +85,17 @@ def vectorize(env: Any, num_envs: int, episode_length: int) -> VectorEnv:
 
     def step(state, action, key):
         env_state = jax.vmap(env.step)(state.env, action)
+        finite = jnp.all(jnp.isfinite(env_state.obs), axis=-1) & jnp.isfinite(env_state.reward)
+        reward = jnp.where(finite, env_state.reward, 0.0)
+        next_obs = jnp.where(along(finite, env_state.obs), env_state.obs, state.obs)
         time = state.time + 1
-        episode_return = state.episode_return + env_state.reward
-        terminated = env_state.done.astype(env_state.reward.dtype)
+        episode_return = state.episode_return + reward
+        terminated = jnp.where(finite, env_state.done, 1).astype(reward.dtype)
         truncated = (time >= episode_length) * (1 - terminated)
         done = (terminated + truncated) > 0
         episode_end = done * state.whole
-        outcome = Outcome(
-            env_state.reward, terminated, truncated, env_state.obs, episode_end, episode_end * episode_return
-        )
+        diverged = 1 - finite.astype(reward.dtype)
+        outcome = Outcome(reward, terminated, truncated, next_obs, episode_end, episode_end * episode_return, diverged)
         running = VectorState(env_state, time, episode_return, state.whole)
         # Drawing and observing new states costs as much as a step in some environments: only where one has ended.
         return jax.lax.cond(jnp.any(done), lambda: _select(done, reset(key), running), lambda: running), outcome
@@ -105,6 +111,15 @@ def stagger(state: VectorState, key: jax.Array, episode_length: int) -> VectorSt
     """
     time = jax.random.randint(key, state.time.shape, 0, episode_length)
     return state._replace(time=time, whole=(time == 0).astype(state.whole.dtype))
+
+
+def divergence(transition: Transition) -> Metrics:
+    """`diverged`, how often the physics did in a rollout, and `diverged_env`, the first environment with it, or -1."""
+    where = jnp.any(transition.diverged > 0, axis=0)
+    return {
+        "diverged": jnp.sum(transition.diverged),
+        "diverged_env": jnp.where(jnp.any(where), jnp.argmax(where), -1).astype(jnp.int32),
+    }
 
 
 def _select(mask: jax.Array, if_true: Any, if_false: Any) -> Any:

@@ -55,10 +55,10 @@ def output_until(process, *texts):
     raise AssertionError(said)
 
 
-def outcome(folder):
+def outcome(folder, which="checkpoints"):
     """The lines of metrics without their times, and the newest checkpoint's number and digest."""
     lines = [json.loads(line) for line in (folder / "metrics.jsonl").read_text().splitlines()]
-    checkpoints = Checkpoints(folder / "checkpoints", read_only=True)
+    checkpoints = Checkpoints(folder / which, read_only=True)
     latest = checkpoints.newest_sound()[0]
     return [{**line, "seconds": None} for line in lines], latest, checkpoints.digest(latest)
 

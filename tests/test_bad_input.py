@@ -81,6 +81,24 @@ MISTAKES = {
         ["algo.gamma=0.9", "sweep.algo.gamma=[0.9,0.95]"],
         "algo.gamma is given and swept: leave out one of them",
     ),
+    "unknown policy for what is not finite": (["nan_policy=ignore"], "must be stop or skip"),
+    "fraction for a seed": (["seed=1.5"], "seed=1.5: expected a whole number"),
+    "switch for a seed": (["seed=true"], "seed=True: expected a whole number"),
+    "nothing for a seed": (["seed="], "seed=: expected a whole number"),
+    "digits of another script": (["seed=\u0663"], "seed=\u0663: expected a whole number"),
+    "rollout beyond 32 bits": (
+        ["num_envs=100000000", "num_steps=30"],
+        "num_envs=100000000 num_steps=30: their product must stay below 2**31",
+    ),
+    "updates beyond 32 bits": (
+        ["num_envs=1", "num_steps=1", "total_steps=1e12"],
+        "total_steps=1000000000000: with 1 steps an update it must stay below 2147483647",
+    ),
+    "rollouts beyond memory": (["num_envs=50000000"], "GB are available: num_envs="),
+    "networks beyond memory": (["network.widths=[1000000,1000000]"], "GB are available: too little"),
+    "agents beyond memory": (["num_seeds=1000000000"], "GB are available: too little"),
+    "evaluations beyond memory": (["eval_episodes=1e12"], "GB are available: "),
+    "auto without a folder": (["resume=auto"], "resume=auto needs run_dir=DIR"),
     "negative mass": (["env.mass=-1"], "env.mass=-1: must be above 0"),
     "rollout length of whole episodes": (["algo=reinforce", "num_steps=10"], "algo=reinforce plays whole episodes"),
     "leave nobody": (["algo=reinforce", "algo.baseline=leave_one_out", "num_envs=1"], "num_envs must be at least 2"),
@@ -136,7 +154,7 @@ def run(main, arguments, monkeypatch, capsys):
 @pytest.mark.parametrize("mistake", MISTAKES)
 def test_mistakes_in_training_options(mistake, monkeypatch, capsys, tmp_path):
     arguments, message = MISTAKES[mistake]
-    if not arguments[0].startswith("resume"):
+    if not arguments[0].startswith("resume="):
         arguments = [*arguments, f"run_dir={tmp_path / 'run'}"]
     status, error = run(train.main, arguments, monkeypatch, capsys)
     assert status == 2
@@ -162,6 +180,11 @@ def tree(folder):
 RUN_MISTAKES = {
     "folder in use": (train, ["run_dir={run}"], "is not empty: take another run_dir, or resume="),
     "folder named like a pattern": (train, ["run_dir={run}/[x]"], "a folder with [ or ] in its name"),
+    "folder with too long a name": (
+        train,
+        ["run_dir={run}/" + 300 * "x"],
+        "cannot write a run folder there (File name",
+    ),
     "folder below a file": (train, ["run_dir={run}/config.yaml/x"], "cannot write a run folder there"),
     "another environment": (train, ["resume={run}", "env=arm"], "env=arm: the run has env=pendulum"),
     "another network": (

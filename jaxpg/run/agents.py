@@ -10,6 +10,7 @@ import numpy as np
 
 from jaxpg.run.config import Config
 from jaxpg.run.sweep import Setting, settings
+from jaxpg.run.sweep import described as words
 
 
 class Agents(NamedTuple):
@@ -62,6 +63,11 @@ def alone(config: Config, agent: int) -> Config:
     seed = config.run.seed + agent % config.run.num_seeds
     run = dataclasses.replace(config.run, seed=seed, num_seeds=1, vmap_seeds=1)
     return dataclasses.replace(with_values(config, setting_of(config, agent)), run=run, sweep={})
+
+
+def described_agent(config: Config, agent: int) -> str:
+    """One agent in words, such as `seed 3 algo.gamma=0.9`."""
+    return f"seed {config.run.seed + agent % config.run.num_seeds} {words(setting_of(config, agent))}".strip()
 
 
 def described(config: Config) -> str:

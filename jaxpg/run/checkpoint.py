@@ -97,7 +97,7 @@ class Checkpoints:
         """
         leaves = _host_leaves(tree)
         content = {name: leaf for name, leaf in leaves.items() if leaf.size}  # orbax refuses empty arrays
-        record = {"meta": dict(meta), "leaves": {name: _describe(leaf) for name, leaf in leaves.items()}}
+        record = {"step": step, "meta": dict(meta), "leaves": {name: _describe(leaf) for name, leaf in leaves.items()}}
         arguments = ocp.args.Composite(state=ocp.args.StandardSave(content), meta=ocp.args.JsonSave(record))
         with self._writing(step):
             saved = self._manager.save(step, args=arguments)
@@ -143,12 +143,15 @@ class Checkpoints:
             shutil.rmtree(unfinished, ignore_errors=True)
 
     def record(self, step: int) -> dict[str, Any]:
-        """What was written beside the arrays: `meta`, and `leaves`, name -> [shape, type, SHA-256].
+        """What was written beside the arrays: `step`, `meta`, and `leaves`, name -> [shape, type, SHA-256].
 
         Raises:
           CheckpointError: it cannot be read.
         """
-        return self._read(step, meta=ocp.args.JsonRestore())["meta"]
+        record = self._read(step, meta=ocp.args.JsonRestore())["meta"]
+        if not isinstance(record, dict) or not {"step", "meta", "leaves"} <= record.keys():
+            raise CheckpointError(f"{self.folder / str(step)}: damaged, its record is not one of ours")
+        return record
 
     def read(self, step: int) -> dict[str, np.ndarray]:
         """Every leaf of checkpoint `step` by its name, verified; random keys as the numbers that they are stored as.
@@ -156,7 +159,10 @@ class Checkpoints:
         Raises:
           CheckpointError: it cannot be read, or its content is damaged.
         """
-        recorded = self.record(step)["leaves"]
+        record = self.record(step)
+        if record["step"] != step:
+            raise CheckpointError(f"{self.folder / str(step)}: damaged, it is what was saved as {record['step']}")
+        recorded = record["leaves"]
         kinds = {name: jax.ShapeDtypeStruct(shape, dtype) for name, (shape, dtype, _) in recorded.items()}
         stored = {name: kind for name, kind in kinds.items() if kind.size}
         restored = self._read(step, state=ocp.args.StandardRestore(stored))["state"]

@@ -87,10 +87,12 @@ def from_dict(values: Mapping[str, Any], problems: Sequence[str] = ()) -> Config
 def _complete(config: Config) -> Config:
     """The rollout length filled in, which depends on algorithm and environment."""
     problems = [*_conflicts_of_the_algorithm(config), *_conflicts_of_the_network(config), *_conflicts_of_agents(config)]
+    default = config.env.episode_length if config.choices["algo"] == "reinforce" else DEFAULT_ROLLOUT
+    config = dataclasses.replace(config, run=dataclasses.replace(config.run, num_steps=config.run.num_steps or default))
+    problems += _conflicts_of_sizes(config.run)
     if problems:
         raise OptionError(problems)
-    default = config.env.episode_length if config.choices["algo"] == "reinforce" else DEFAULT_ROLLOUT
-    return dataclasses.replace(config, run=dataclasses.replace(config.run, num_steps=config.run.num_steps or default))
+    return config
 
 
 def _conflicts_of_the_algorithm(config: Config) -> Iterator[str]:
@@ -129,6 +131,16 @@ def _conflicts_of_agents(config: Config) -> Iterator[str]:
         )
     if run.num_seeds + run.seed > 2**32:
         yield f"seed={run.seed} num_seeds={run.num_seeds}: seeds must stay below 2**32"
+
+
+def _conflicts_of_sizes(run: Run) -> Iterator[str]:
+    """XLA's indices and the counter of updates are 32-bit numbers."""
+    rollout = run.num_envs * run.num_steps
+    if rollout >= 2**31:
+        yield f"num_envs={run.num_envs} num_steps={run.num_steps}: their product must stay below 2**31"
+    elif run.total_steps // rollout >= 2**31 - 1:
+        most = rollout * (2**31 - 1)
+        yield f"total_steps={run.total_steps}: with {rollout} steps an update it must stay below {most}"
 
 
 def _nearest_divisor(number: int, to: int) -> int:

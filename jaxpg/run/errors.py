@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import gc
+import os
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager, redirect_stderr, redirect_stdout
+from typing import Any, TextIO
 
 from envs.options import OptionError
 from envs.physics import MujocoModelError
@@ -16,15 +19,16 @@ class UserError(Exception):
 
 def run_command(main: Callable[[Sequence[str]], int | None]) -> None:
     """`sys.exit(main(arguments))`, where a user's mistake ends in its message and status 2."""
-    try:
-        status = main(sys.argv[1:])
-    except OptionError as error:
-        status = _report(error.problems)
-    except (UserError, MujocoModelError) as error:
-        status = _report([str(error)])
-    except KeyboardInterrupt:
-        print("interrupted", file=sys.stderr)
-        status = 130
+    with _unbreakable_output():
+        try:
+            status = main(sys.argv[1:])
+        except OptionError as error:
+            status = _report(error.problems)
+        except (UserError, MujocoModelError) as error:
+            status = _report([str(error)])
+        except KeyboardInterrupt:
+            print("interrupted", file=sys.stderr)
+            status = 130
     gc.freeze()  # the interpreter's last collections would look through all that jax has made: half a second
     sys.exit(status)
 
@@ -33,3 +37,47 @@ def _report(problems: Sequence[str]) -> int:
     for problem in problems:
         print(f"error: {problem}", file=sys.stderr)
     return 2
+
+
+class Unbreakable:
+    """A text stream that goes on in silence when nobody reads it any more, as behind `| head`, or its disk is full.
+
+    Args:
+      stream: where the text goes; what it has no letter for is written as an escape. None goes nowhere.
+      descriptor: of the stream's file; led to the null device when the stream breaks, with all that waits in it.
+    """
+
+    def __init__(self, stream: TextIO | None, descriptor: int):
+        self._stream = open(os.devnull, "w", encoding="utf-8") if stream is None else stream  # noqa: SIM115
+        self._descriptor = descriptor
+        if hasattr(self._stream, "reconfigure"):
+            self._stream.reconfigure(errors="backslashreplace")
+
+    def write(self, text: str) -> int:
+        return self._try(self._stream.write, text)
+
+    def flush(self) -> None:
+        self._try(self._stream.flush)
+
+    def _try(self, function: Callable, *arguments: Any) -> Any:
+        try:
+            return function(*arguments)
+        except OSError:
+            null = os.open(os.devnull, os.O_WRONLY)
+            os.dup2(null, self._descriptor)
+            os.close(null)
+            return function(*arguments)
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._stream, name)
+
+
+@contextmanager
+def _unbreakable_output() -> Iterator[None]:
+    out, error = Unbreakable(sys.stdout, 1), Unbreakable(sys.stderr, 2)
+    with redirect_stdout(out), redirect_stderr(error):
+        try:
+            yield
+        finally:
+            out.flush()
+            error.flush()

@@ -26,6 +26,7 @@ from jaxpg.run.agents import Agents, agents_of, with_values
 from jaxpg.run.config import Config
 from jaxpg.run.folder import num_threads
 from jaxpg.run.state import Policy, RunState, current_policy, is_key, start
+from jaxpg.soundness import sound
 from jaxpg.training import initial_state, train_scan
 from jaxpg.types import Algorithm, Metrics, TrainState
 from jaxpg.vector_env import vectorize
@@ -233,7 +234,7 @@ def compile_program(
     networks = make_networks(config, env)
 
     def algorithm(agent):
-        return make_algorithm(with_values(config, agent.values), env)
+        return sound(make_algorithm(with_values(config, agent.values), env), run.nan_policy)
 
     def init(agent):
         return initial_run(algorithm(agent), agent.seed)

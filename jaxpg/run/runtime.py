@@ -1,41 +1,73 @@
-"""What has to be settled before JAX starts its CPU backend, and requests to stop while it computes."""
+"""What has to be settled before JAX starts its backend, and requests to stop while it computes."""
 
 from __future__ import annotations
 
 import os
 import signal
+import subprocess
+import sys
 from types import FrameType
 
+import jax
 import jaxlib
 
 from jaxpg.compatibility import may_deadlock
 from jaxpg.run.config import Config
+from jaxpg.run.errors import UserError
 from jaxpg.run.folder import num_threads
 
 
 def prepare(config: Config, threads: int | None = None) -> None:
-    """Pins the number of XLA's threads, on which the bits of large reductions depend.
+    """Starts the backend, with the number of XLA's threads pinned, on which the bits of large reductions depend.
 
     Args:
       config: brax's environments make LAPACK calls, which need a single thread on some jaxlib releases.
       threads: those of the run that is resumed; by default as many as there are cores.
+
+    Raises:
+      UserError: the process's environment asks JAX for something that cannot be trained with.
     """
+    _check_variables()
     if threads is None and config.choices["env"] == "brax" and may_deadlock(jaxlib.__version__):
         threads = 1
     os.environ["PJRT_NPROC"] = str(threads or num_threads())
+    try:
+        jax.devices()
+    except RuntimeError as error:
+        raise UserError(f"JAX_PLATFORMS={jax.config.jax_platforms}: {str(error).splitlines()[0]}") from error
+
+
+def _check_variables() -> None:
+    if jax.config.jax_enable_x64:
+        raise UserError("JAX_ENABLE_X64: training is in float32; unset it")
+    if jax.config.jax_disable_jit:
+        raise UserError("JAX_DISABLE_JIT: training is one compiled program; unset it")
+    threads = os.environ.get("PJRT_NPROC")
+    if threads and not (threads.isascii() and threads.isdigit() and int(threads)):
+        raise UserError(f"PJRT_NPROC={threads}: expected a whole number of threads, at least 1")
+    flags = os.environ.get("XLA_FLAGS")
+    if flags:  # at one that it does not know XLA ends the process
+        attempt = [sys.executable, "-c", "import jax; jax.devices()"]
+        ended = subprocess.run(attempt, capture_output=True, text=True, check=False)
+        if ended.returncode:
+            lines = [line for line in ended.stderr.splitlines() if "flag" in line.lower()]
+            reason = lines[0].partition("] ")[2] if lines else f"status {ended.returncode}"
+            raise UserError(f"XLA_FLAGS={flags}: XLA does not start with it ({reason or lines[0]})")
 
 
 class StopRequests:
-    """SIGINT and SIGTERM as a request to stop at the next occasion; a second SIGINT stops at once.
+    """SIGINT, SIGTERM and SIGHUP as a request to stop at the next occasion; a second SIGINT stops at once.
 
-    As a context manager; `signal` is the signal that came, or None.
+    As a context manager; `signal` is the signal that came, or None. What the process was told to ignore, as `nohup`
+    does with SIGHUP, stays ignored.
     """
 
-    HANDLED = (signal.SIGINT, signal.SIGTERM)
+    HANDLED = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
     def __enter__(self) -> StopRequests:
         self.signal: signal.Signals | None = None
-        self._before = {number: signal.signal(number, self._note) for number in self.HANDLED}
+        heard = [number for number in self.HANDLED if signal.getsignal(number) is not signal.SIG_IGN]
+        self._before = {number: signal.signal(number, self._note) for number in heard}
         return self
 
     def __exit__(self, *exception: object) -> None:

@@ -16,6 +16,7 @@ from envs.options import option
 from jaxpg.actor_critic import BASELINES, ESTIMATORS, RETURNS
 from jaxpg.features import FEATURES
 from jaxpg.networks import ACTIVATIONS, SIGMAS
+from jaxpg.soundness import POLICIES
 
 
 def number(default: float | None, help: str, **bounds: float) -> Any:
@@ -142,6 +143,11 @@ class Run:
     eval_episodes: int = option(512, "episodes of an evaluation", at_least=1)
     stop_return: float | None = option(None, "the run ends early at an evaluation with this return; null: not")
     stop_agents: str = option("all", "of several agents, which must have reached it", choices=("all", "one"))
+    nan_policy: str = option(
+        "stop",
+        "an update whose numbers are not finite: its agent stops before it, or goes on without",
+        choices=POLICIES,
+    )
     checkpoint_interval: int = option(1_000_000, "environment steps between two checkpoints", at_least=1)
     run_dir: str | None = option(None, "run folder [default: runs/<env>-<algo>-s<seed>-<time>]")
     cache: bool = option(True, "keep compiled programs in the user's cache folder, for the next run")

@@ -8,28 +8,33 @@ import time
 from collections.abc import Callable, Iterable, Mapping
 from typing import Any, NamedTuple
 
+import jax
 import numpy as np
 
-from jaxpg.run import agents, figures, folder, lock, results
+from jaxpg.run import agents, figures, folder, lock, memory, results
 from jaxpg.run import config as configuration
 from jaxpg.run.cache import compilation_cache, physics_cache
+from jaxpg.run.chunks import Watch, summary
 from jaxpg.run.config import Config
 from jaxpg.run.errors import UserError
 from jaxpg.run.folder import MetricsLog, RunFolder, jsonable
+from jaxpg.run.keeper import Keeper
 from jaxpg.run.program import Program, Schedule, compile_program, make_env, plan
 from jaxpg.run.runtime import StopRequests, prepare
 from jaxpg.run.schema import Run
 from jaxpg.run.state import Best, RunState, better, current_policy
 from jaxpg.run.terminal import Display, shown
-from jaxpg.types import Metrics, TrainState
+from jaxpg.run.watchdog import Watchdog
+from jaxpg.types import TrainState
 
 # Slow to import and not needed before training: imported while XLA compiles.
 NEEDED_LATER = ("jaxpg.run.checkpoint", "tensorboardX", "matplotlib.figure", "matplotlib.backends.backend_agg")
 # What may change together with resume=DIR; anything else would be another run.
 RESUMABLE = (
     *("total_steps", "log_interval", "eval_interval", "checkpoint_interval"),
-    *("stop_return", "stop_agents", "cache"),
+    *("stop_return", "stop_agents", "nan_policy", "cache"),
 )
+EXPLODED = 4  # the exit status of a run that ended because its numbers were not finite any more
 NOT_SAVED = 5  # the exit status of a run whose last state is on no disk
 
 
@@ -155,8 +160,11 @@ def _check_same_run(run_folder: RunFolder, stored: Config, config: Config, names
 
 
 def _env(config: Config) -> Any:
+    """The environment of a run that fits into memory."""
     with physics_cache(config.run.cache):
-        return make_env(config)
+        env = make_env(config)
+    memory.check(config, env)
+    return env
 
 
 def _compile(session: Session, env: Any, resumed: bool = False) -> tuple[Program, float]:
@@ -183,16 +191,20 @@ def _train(session: Session, program: Program, state: RunState, compile_seconds:
     solved = False
     first = update = _update(state.train)
     log = MetricsLog(run_folder, update, display.say)
-    keeper = _Keeper(session, log)
+    keeper = Keeper(config, run_folder, log, display.say)
+    watch, watchdog = Watch(config, display.say), Watchdog()
     began, seconds_before = time.monotonic(), log.seconds
     display.start()
     try:
         with StopRequests() as stop:
             while update < schedule.num_updates and not solved and not stop.signal:
-                train, metrics = program.advance(state.train)
-                update = _update(train)
-                line = {"update": update, "steps": update * schedule.steps_per_update} | _summary(metrics)
-                state = state._replace(train=train)
+                with watchdog.chunk(f"update {update + 1:,} to {update + schedule.chunk:,}"):
+                    train, metrics = jax.block_until_ready(program.advance(state.train))
+                watch.look(state.train, metrics)
+                if watch.nobody_goes_on:
+                    break
+                state, update = state._replace(train=train), update + schedule.chunk
+                line = {"update": update, "steps": update * schedule.steps_per_update} | summary(metrics)
                 if schedule.is_due(update, schedule.eval_every):
                     state, evaluation = _evaluate(program, state)
                     line |= evaluation
@@ -207,16 +219,17 @@ def _train(session: Session, program: Program, state: RunState, compile_seconds:
     finally:
         display.stop()
         log.close()
-    steps = f"{update * schedule.steps_per_update:,} steps"
+    steps, again = f"{update * schedule.steps_per_update:,} steps", f"resume={run_folder.path}"
+    if watch.nobody_goes_on:
+        display.say(f"error: {watch.problem}; stopped at {steps}; {again} nan_policy=skip leaves it out")
+        return EXPLODED
     if keeper.failed:
-        display.say(
-            f"error: the last state, at {steps}, could not be saved; resume={run_folder.path} repeats what is lost"
-        )
+        display.say(f"error: the last state, at {steps}, could not be saved; {again} repeats what is lost")
         return NOT_SAVED
     if solved:
         display.say(f"reached stop_return={config.run.stop_return:g} after {steps}")
     elif update < schedule.num_updates:
-        display.say(f"{stop.signal.name}: stopped at {steps}; resume={run_folder.path} goes on")
+        display.say(f"{stop.signal.name}: stopped at {steps}; {again} goes on")
         return 128 + stop.signal
     training_seconds = time.monotonic() - began
     rate = (update - first) * schedule.steps_per_update * config.num_agents / training_seconds
@@ -234,8 +247,8 @@ def _show_results(session: Session, rate: float, compile_seconds: float, trainin
 
 
 def _update(train: TrainState) -> int:
-    """The updates made; read by numpy, as jax would compile a program that picks the number."""
-    return int(np.asarray(train.update)[0])
+    """The updates made, by the agents that still go on; read by numpy, as jax would compile a program for it."""
+    return int(np.asarray(train.update).max())
 
 
 def _draw(session: Session) -> list[dict[str, Any]]:
@@ -250,63 +263,6 @@ def _draw(session: Session) -> list[dict[str, Any]]:
     except OSError as error:
         session.display.say(f"note: {run_folder.learning_curve}: cannot be written ({error.strerror})")
     return lines
-
-
-class _Keeper:
-    """Writes the run's state to `checkpoints/` and its best policy to `best/`, or says that it could not.
-
-    Attributes:
-      saved: the last update whose state, best policy and lines of metrics this process has saved; None before.
-      failed: whether the last save has failed.
-    """
-
-    def __init__(self, session: Session, log: MetricsLog):
-        from jaxpg.run.checkpoint import Checkpoints
-
-        self._checkpoints = Checkpoints(session.run_folder.checkpoints)
-        self._best = Checkpoints(session.run_folder.best, keep=1)
-        self._meta = {"config": session.config.to_dict()}
-        self._log, self._say = log, session.display.say
-        self._last: int | None = None  # the newest checkpoint of this process
-        self.saved: int | None = None
-        self.failed = False
-
-    def save(self, update: int, state: RunState) -> None:
-        """Saves the state after `update` updates; the first of several failures is said, and the end of them."""
-        problem = self._problem(update, state)
-        if problem and not self.failed:
-            self._say(f"note: {problem}; training goes on, and saving is tried again at each line of metrics")
-        elif self.failed and not problem:
-            self._say(f"note: saved again, after {update:,} updates")
-        self.failed = problem is not None
-        if not problem:
-            self.saved = update
-
-    def _problem(self, update: int, state: RunState) -> str | None:
-        """Saves; what has kept it from that."""
-        from jaxpg.run.checkpoint import SaveError
-
-        try:
-            self._log.flush()  # first: a checkpoint whose lines are not there would be resumed with a gap
-            if self._last != update:  # else only the best policy is missing
-                self._checkpoints.replace(update, state, self._meta)  # damaged ones may be newer than what was resumed
-                self._last = update
-            self._best.replace(update, state.best, self._meta)
-        except SaveError as error:
-            return str(error)
-        except OSError as error:
-            where = self._checkpoints.folder / str(update)
-            return f"{where}: not written without its lines of metrics, which cannot be ({error.strerror})"
-        return None
-
-
-def _summary(metrics: Metrics) -> dict[str, Any]:
-    """One line of metrics for a chunk: means over its updates, and the mean return of the episodes that ended."""
-    values = {name: np.asarray(value, np.float64) for name, value in metrics.items()}  # [S, chunk]
-    return_sum, episodes = values.pop("return_sum").sum(axis=-1), values.pop("episodes").sum(axis=-1)
-    mean_return = np.where(episodes > 0, return_sum / np.maximum(episodes, 1), np.nan)
-    means = {name: jsonable(value.mean(axis=-1)) for name, value in values.items()}
-    return {"return": jsonable(mean_return), "episodes": jsonable(episodes)} | means
 
 
 def _evaluate(program: Program, state: RunState) -> tuple[RunState, dict[str, Any]]:

@@ -1,0 +1,96 @@
+"""What a chunk of updates says: its line of metrics, and whether its numbers were finite."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+from jaxpg.run.agents import described_agent
+from jaxpg.run.config import Config
+from jaxpg.run.folder import jsonable
+from jaxpg.soundness import quantities
+from jaxpg.types import Metrics, TrainState
+
+# Numbers of an update that are no measurements: see `jaxpg.soundness.sound` and `jaxpg.vector_env.divergence`.
+FLAGS = ("unsound", "unsound_env", "diverged_env")
+
+
+def summary(metrics: Metrics) -> dict[str, Any]:
+    """One line of metrics for a chunk: means over its sound updates, and the mean return of the episodes that ended.
+
+    Args:
+      metrics: of the updates, `[S, chunk]` by name.
+
+    Returns:
+      A number by name, or a list of them with one for each agent. `skipped` and `diverged` are counts: of updates that
+      were not applied, and of environments whose physics diverged.
+    """
+    values = {name: np.asarray(value, np.float64) for name, value in metrics.items()}
+    unsound = values["unsound"] > 0
+    values = {name: np.where(unsound, np.nan, value) for name, value in values.items() if name not in FLAGS}
+    sums = {name: np.nansum(values.pop(name), axis=-1) for name in ("return_sum", "episodes", "diverged")}
+    mean_return = np.where(sums["episodes"] > 0, sums["return_sum"] / np.maximum(sums["episodes"], 1), np.nan)
+    counts = {"skipped": unsound.sum(axis=-1), "diverged": sums["diverged"]}
+    found = {"return": mean_return, "episodes": sums["episodes"]} | {name: _mean(x) for name, x in values.items()}
+    return {name: jsonable(x) for name, x in (found | counts).items()}
+
+
+def _mean(values: np.ndarray) -> np.ndarray:
+    """The mean of each row's numbers, NaN where it has none."""
+    number = (~np.isnan(values)).sum(axis=-1)
+    return np.where(number > 0, np.nansum(values, axis=-1) / np.maximum(number, 1), np.nan)
+
+
+class Watch:
+    """Says what was not finite, once for each agent, and knows who stands still since then.
+
+    Args:
+      config: of the run.
+      say: takes the notes.
+
+    Attributes:
+      problem: what was seen first of all; None as long as all numbers are finite.
+      nobody_goes_on: whether no update of the last chunk was applied, of any agent.
+    """
+
+    def __init__(self, config: Config, say: Callable[[str], None]):
+        self._config, self._say = config, say
+        self._noted: set[int] = set()
+        self._diverged = False
+        self.problem: str | None = None
+        self.nobody_goes_on = False
+
+    def look(self, before: TrainState, metrics: Metrics) -> None:
+        """Takes in a chunk: the state that it began with, and its metrics, `[S, chunk]`."""
+        unsound, first_update = np.asarray(metrics["unsound"]), np.asarray(before.update) + 1
+        for agent in np.flatnonzero(unsound.any(axis=-1)):
+            if agent not in self._noted:
+                self._noted.add(agent)
+                self._note(agent, first_update[agent], metrics)
+        self.nobody_goes_on = bool((unsound > 0).all())
+        diverged = np.argwhere(np.asarray(metrics["diverged"]) > 0)
+        if len(diverged) and not self._diverged:
+            self._diverged = True
+            agent, at = diverged[0]
+            environment = int(np.asarray(metrics["diverged_env"])[agent, at])
+            self._say(
+                f"note: update {first_update[agent] + at:,}: the physics of environment {environment}"
+                f"{self._of(agent)} diverged; its episode ended there, and diverged in metrics.jsonl counts such"
+            )
+
+    def _note(self, agent: int, first_update: int, metrics: Metrics) -> None:
+        codes = np.asarray(metrics["unsound"])[agent]
+        at = int(np.argmax(codes > 0))
+        what = quantities(set(metrics) - set(FLAGS))[codes[at] - 1]
+        environment = int(np.asarray(metrics["unsound_env"])[agent, at])
+        where = f" of environment {environment}" if environment >= 0 else ""
+        problem = f"update {first_update + at:,}: {what}{where} is not finite{self._of(agent)}"
+        self.problem = self.problem or problem
+        stops = self._config.run.nan_policy == "stop"
+        if self._config.num_agents > 1 or not stops:
+            self._say(f"note: {problem}; {'this agent stops before it' if stops else 'such updates are left out'}")
+
+    def _of(self, agent: int) -> str:
+        return f", {described_agent(self._config, agent)}" if self._config.num_agents > 1 else ""

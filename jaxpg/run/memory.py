@@ -1,0 +1,90 @@
+"""Whether a run fits into the machine's memory, before anything is written or compiled.
+
+Linux kills a process that takes more than there is, without a word: the only defence is to ask for less.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import itertools
+import resource
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import jax
+
+from jaxpg.features import num_features
+from jaxpg.run.config import Config
+from jaxpg.run.errors import UserError
+from jaxpg.run.folder import num_threads
+from jaxpg.run.program import plan
+from jaxpg.types import PyTree
+
+NUMBER = 4  # bytes
+# Of a step of an environment, beside observations and actions: reward, ends, returns, values, advantages, ...
+SCALARS = 5
+METRICS = 16  # numbers that an update reports
+# Where the groups of this process are told their limits, of cgroups in version 2 and 1.
+CGROUPS = (
+    ("/sys/fs/cgroup/memory.max", "/sys/fs/cgroup/memory.current"),
+    ("/sys/fs/cgroup/memory/memory.limit_in_bytes", "/sys/fs/cgroup/memory/memory.usage_in_bytes"),
+)
+
+
+def check(config: Config, env: Any) -> None:
+    """Raises UserError where the run needs more memory than is available."""
+    run, need, have = config.run, needed(config, env), available()
+    if have is None or need <= have:
+        return
+    least = needed(dataclasses.replace(config, run=dataclasses.replace(run, num_envs=1)), env)
+    fits = int((run.num_envs - 1) * (have - least) / max(need - least, 1)) + 1  # it is linear in num_envs
+    raise UserError(
+        f"num_envs={run.num_envs} num_steps={run.num_steps}: such a training needs {need / 1e9:,.1f} GB of memory or "
+        f"more, {have / 1e9:,.1f} GB are available: {f'num_envs={fits} would fit' if have > least else 'too little'}"
+    )
+
+
+def needed(config: Config, env: Any) -> int:
+    """Bytes of what a run holds at once: the agents' states, the rollouts that are learned from, a chunk's metrics.
+
+    It is an estimate from below: XLA may keep more.
+    """
+    run, network, online = config.run, config.network, config.choices["algo"] == "online"
+    features = num_features(network.features, env.observation_size, network.order)
+    widths = [features, *getattr(network, "widths", ())]
+    params = NUMBER * 2 * (sum(a * b for a, b in itertools.pairwise(widths)) + widths[-1] * env.action_size)
+    of_env = num_bytes(jax.eval_shape(env.reset, jax.random.key(0)))
+    # Of Adam there are two further numbers for each parameter; of traces one in each environment.
+    state = params * (run.num_envs if online else 3) + of_env * run.num_envs
+    # A rollout as it was played, and the batch that is made of it, with what its gradients pass through.
+    hidden = 2 * sum(widths[1:]) // getattr(config.algo, "minibatches", 1)
+    step = 2 * env.observation_size + features + 2 * env.action_size + SCALARS + hidden
+    rollout = 0 if online else NUMBER * step * run.num_steps * run.num_envs
+    episodes = of_env * run.eval_episodes
+    chunk = NUMBER * METRICS * plan(config).chunk
+    at_once = min(config.num_agents, run.vmap_seeds * num_threads())
+    return (state + chunk) * (config.num_agents + at_once) + max(rollout, episodes) * at_once
+
+
+def num_bytes(tree: PyTree) -> int:
+    """Of the arrays in a tree, or of their shapes and types."""
+    return sum(leaf.size * leaf.dtype.itemsize for leaf in jax.tree.leaves(tree))
+
+
+def available() -> int | None:
+    """Bytes that the process can still have, of the machine, its control group and its limits; None if nobody says."""
+    return min(_limits(), default=None)
+
+
+def _limits() -> Iterator[int]:
+    with contextlib.suppress(OSError, ValueError):
+        fields = dict(line.split(":") for line in Path("/proc/meminfo").read_text().splitlines())
+        yield 1024 * int(fields["MemAvailable"].split()[0])
+    for limit, usage in CGROUPS:
+        with contextlib.suppress(OSError, ValueError):  # "max" is no number, and no limit
+            yield max(int(Path(limit).read_text()) - int(Path(usage).read_text()), 0)
+    soft, _ = resource.getrlimit(resource.RLIMIT_AS)
+    if soft != resource.RLIM_INFINITY:
+        yield soft

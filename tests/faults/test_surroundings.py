@@ -1,0 +1,202 @@
+"""Terminals, variables and folders of any kind: the same bits, or one line that says what is wrong."""
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+from processes import RUN, outcome, training
+
+from jaxpg.run.checkpoint import Checkpoints
+
+TRAIN = (sys.executable, "-m", "jaxpg.train")
+
+
+def some(cases, few):
+    """All cases as parameters; all but the few named ones are marked as faults."""
+    return [pytest.param(name, id=name, marks=[] if name in few else [pytest.mark.faults]) for name in cases]
+
+
+@pytest.fixture(scope="module")
+def undisturbed(command, tmp_path_factory):
+    folder = tmp_path_factory.mktemp("runs") / "undisturbed"
+    assert command("train", *RUN, f"run_dir={folder}").returncode == 0
+    return outcome(folder), training_state(folder)
+
+
+# --- what must change nothing -----------------------------------------------------------------------------------------
+
+VARIABLES = {
+    "narrow": {"COLUMNS": "40"},
+    "no colour": {"NO_COLOR": "1", "TERM": "dumb"},
+    "ascii": {"LC_ALL": "C", "PYTHONIOENCODING": "ascii", "PYTHONUTF8": "0"},
+    "hash seed": {"PYTHONHASHSEED": "1"},
+    "time zone": {"TZ": "Pacific/Kiritimati"},
+    "no home": {"HOME": "/nonexistent", "XDG_CACHE_HOME": ""},
+    "no cache": {"XDG_CACHE_HOME": "/proc/nothing"},
+    "one OpenMP thread": {"OMP_NUM_THREADS": "1"},
+    "synchronous": {"JAX_CPU_ENABLE_ASYNC_DISPATCH": "false"},
+    "own cache of jax": {"JAX_COMPILATION_CACHE_DIR": "{tmp}/jax"},
+}
+
+
+@pytest.mark.parametrize("name", some(VARIABLES, ["ascii", "no home"]))
+def test_variables_that_change_no_bit(name, undisturbed, command_environment, tmp_path):
+    """Nor do they make noise; the folder's name has a letter that not every terminal can show."""
+    variables = {key: value.format(tmp=tmp_path) for key, value in VARIABLES[name].items()}
+    folder = tmp_path / "an äußerst long name for a folder, for a terminal of forty columns"
+    command = [*TRAIN, *RUN, f"run_dir={folder}"]
+    result = subprocess.run(command, env=command_environment | variables, capture_output=True, check=False)
+    assert result.returncode == 0, result.stderr
+    assert result.stderr == b""
+    assert outcome(folder) == undisturbed[0]
+
+
+OPTIONS = {
+    "no cache": ["cache=false"],
+    "one chunk": ["log_interval=1600"],
+    "long chunks": ["log_interval=64"],
+    "no evaluation": ["eval_interval=1600"],
+    "one checkpoint": ["checkpoint_interval=1600"],
+    "skip": ["nan_policy=skip"],
+}
+
+
+@pytest.mark.parametrize("name", some(OPTIONS, ["long chunks"]))
+def test_options_that_change_no_bit(name, undisturbed, command, tmp_path):
+    """Of the training state, that is: its best policy depends on the evaluations."""
+    given = dict(argument.split("=") for argument in (*RUN, *OPTIONS[name]))
+    folder = tmp_path / "run"
+    result = command("train", *(f"{key}={value}" for key, value in given.items()), f"run_dir={folder}")
+    assert result.returncode == 0, result.stderr
+    assert training_state(folder) == undisturbed[1]
+
+
+def training_state(folder):
+    """Shape, type and digest of every array of the newest training state."""
+    checkpoints = Checkpoints(folder / "checkpoints", read_only=True)
+    leaves = checkpoints.record(checkpoints.latest())["leaves"]
+    state = {name: leaf for name, leaf in leaves.items() if name.startswith("train/")}
+    assert state
+    return state
+
+
+def test_one_core_with_the_same_threads(command_environment, undisturbed, tmp_path):
+    """The number of XLA's threads is pinned, not taken from the cores that are free."""
+    threads = str(len(os.sched_getaffinity(0)))
+    folder = tmp_path / "run"
+    command = [*TRAIN, *RUN, f"run_dir={folder}"]
+    core = {min(os.sched_getaffinity(0))}
+    result = subprocess.run(
+        command,
+        env=command_environment | {"PJRT_NPROC": threads},
+        capture_output=True,
+        check=False,
+        preexec_fn=lambda: os.sched_setaffinity(0, core),
+    )
+    assert result.returncode == 0, result.stderr
+    assert outcome(folder) == undisturbed[0]
+
+
+# --- output -----------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("end", ["| head -1", "> /dev/full", ">&- 2>&-", "2>&1 | true"])
+def test_output_that_nobody_reads(end, undisturbed, command_environment, tmp_path):
+    folder = tmp_path / "run"
+    line = " ".join([*TRAIN, *RUN, f"run_dir={folder}", end])
+    result = subprocess.run(["bash", "-c", f"set -o pipefail; {line}"], env=command_environment, capture_output=True)
+    assert result.stderr == b""
+    assert result.returncode == 0
+    assert outcome(folder) == undisturbed[0]
+
+
+def test_a_terminal_that_hangs_up(command_environment, tmp_path):
+    """SIGHUP is a request to stop, as SIGTERM is; under nohup it is nothing."""
+    for ignored in (False, True):
+        folder = tmp_path / f"ignored-{ignored}"
+        before = signal.signal(signal.SIGHUP, signal.SIG_IGN if ignored else signal.SIG_DFL)
+        try:
+            with training(command_environment, *RUN, f"run_dir={folder}") as process:
+                while not (folder / "metrics.jsonl").exists():
+                    time.sleep(0.01)
+                time.sleep(0.1)
+                process.send_signal(signal.SIGHUP)
+                said = process.stdout.read()
+                assert process.wait() == (0 if ignored else 129), said
+        finally:
+            signal.signal(signal.SIGHUP, before)
+        assert ("SIGHUP: stopped at" in said) != ignored
+
+
+# --- what is refused --------------------------------------------------------------------------------------------------
+
+REFUSED = {
+    "no such platform": ({"JAX_PLATFORMS": "cuda"}, "JAX_PLATFORMS=cuda: "),
+    "float64": ({"JAX_ENABLE_X64": "1"}, "JAX_ENABLE_X64: training is in float32"),
+    "no jit": ({"JAX_DISABLE_JIT": "1"}, "JAX_DISABLE_JIT: training is one compiled program"),
+    "threads in words": ({"PJRT_NPROC": "two"}, "PJRT_NPROC=two: expected a whole number of threads"),
+    "no threads": ({"PJRT_NPROC": "0"}, "PJRT_NPROC=0: expected a whole number of threads, at least 1"),
+    "unknown flag": ({"XLA_FLAGS": "--xla_nonsense=1"}, "XLA_FLAGS=--xla_nonsense=1: XLA does not start with it"),
+}
+
+
+@pytest.mark.parametrize("name", some(REFUSED, ["no threads", "unknown flag"]))
+def test_variables_that_are_refused(name, command_environment, tmp_path):
+    variables, message = REFUSED[name]
+    command = [*TRAIN, *RUN, f"run_dir={tmp_path / 'run'}"]
+    result = subprocess.run(command, env=command_environment | variables, capture_output=True, text=True, check=False)
+    assert result.returncode == 2, result.stderr
+    assert result.stderr.startswith(f"error: {message}"), result.stderr
+    assert len(result.stderr.splitlines()) == 1
+    assert not (tmp_path / "run").exists()
+
+
+# --- folders ----------------------------------------------------------------------------------------------------------
+
+
+def test_a_link_to_a_folder_elsewhere(undisturbed, command, tmp_path):
+    (tmp_path / "elsewhere").mkdir()
+    (tmp_path / "link").symlink_to(tmp_path / "elsewhere")
+    assert command("train", *RUN, f"run_dir={tmp_path / 'link'}").returncode == 0
+    assert outcome(tmp_path / "elsewhere") == undisturbed[0]
+
+
+@pytest.mark.faults
+def test_a_relative_folder_below_folders_that_are_not_there(undisturbed, command, tmp_path):
+    assert command("train", *RUN, "run_dir=a/b/../c", cwd=tmp_path).returncode == 0
+    assert outcome(tmp_path / "a" / "c") == undisturbed[0]
+
+
+@pytest.mark.faults
+def test_a_run_that_was_moved_goes_on(undisturbed, command, command_environment, tmp_path):
+    before, after = tmp_path / "before", tmp_path / "after"
+    with training(command_environment, *RUN, f"run_dir={before}") as process:
+        while not (before / "checkpoints" / "20").exists():
+            time.sleep(0.005)
+        process.kill()
+        process.wait()
+    Path(before).rename(after)
+    assert command("train", f"resume={after}").returncode == 0
+    assert outcome(after) == undisturbed[0]
+    assert not before.exists()
+
+
+def test_strangers_among_the_checkpoints(undisturbed, command, command_environment, tmp_path):
+    """An empty folder with a number for a name, a file, and what a save leaves that was killed."""
+    folder = tmp_path / "run"
+    with training(command_environment, *RUN, f"run_dir={folder}") as process:
+        while not (folder / "checkpoints" / "20").exists():
+            time.sleep(0.005)
+        process.kill()
+        process.wait()
+    (folder / "checkpoints" / "999").mkdir()
+    (folder / "checkpoints" / "notes.txt").write_text("mine")
+    (folder / "checkpoints" / "30.orbax-checkpoint-tmp").mkdir()
+    result = command("train", f"resume={folder}")
+    assert result.returncode == 0, result.stderr
+    assert "checkpoints/999: cannot be read" in result.stdout
+    assert outcome(folder) == undisturbed[0]

@@ -1,0 +1,62 @@
+"""A chunk that does not end is spoken of, once, with where it stands; one that ends is not."""
+
+import os
+import signal
+import subprocess
+import sys
+import time
+
+from jaxpg.run import watchdog
+from jaxpg.run.watchdog import Watchdog
+
+
+def test_what_ends_in_time_is_left_alone(capfd):
+    dog = Watchdog(at_least=5.0)
+    for _ in range(3):
+        with dog.chunk("update 1 to 2"):
+            time.sleep(0.01)
+    assert capfd.readouterr() == ("", "")
+
+
+def test_what_does_not_end_is_named_with_its_stack(capfd):
+    with Watchdog(at_least=0.2, pulse=0.05).chunk("update 1 to 2"):
+        time.sleep(1.0)
+    error = capfd.readouterr().err
+    assert error.startswith("warning: update 1 to 2 has not ended after 0 s: ")
+    assert error.count("warning:") == 1
+    assert "test_what_does_not_end_is_named_with_its_stack" in error
+
+
+def test_ten_times_the_usual_is_allowed():
+    dog = Watchdog(at_least=0.0)
+    for seconds in (0.01, 0.05, 0.01):
+        with dog.chunk("update"):
+            time.sleep(seconds)
+    assert 0.1 <= dog.limit < 0.4
+
+
+def test_the_likely_cause_depends_on_jaxlib(monkeypatch):
+    monkeypatch.setattr(watchdog.jaxlib, "__version__", "0.10.1")
+    assert "PJRT_NPROC=1 avoids it" in watchdog.likely_cause()
+    monkeypatch.setattr(watchdog.jaxlib, "__version__", "0.11.1")
+    assert "LAPACK" not in watchdog.likely_cause()
+
+
+def test_time_in_which_the_process_is_stopped_does_not_count():
+    code = """
+import time
+from jaxpg.run.watchdog import Watchdog
+with Watchdog(at_least=1.5, pulse=0.1).chunk("update"):
+    print("began", flush=True)
+    time.sleep(0.8)
+    end = time.monotonic() + 0.2
+    while time.monotonic() < end: pass
+"""
+    with subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, stderr=subprocess.PIPE) as process:
+        process.stdout.readline()
+        process.send_signal(signal.SIGSTOP)
+        os.waitid(os.P_PID, process.pid, os.WSTOPPED | os.WNOWAIT)
+        time.sleep(3)
+        process.send_signal(signal.SIGCONT)
+        assert process.stderr.read() == b""
+        assert process.wait() == 0
