@@ -24,7 +24,7 @@ LEVELS = [
         "compatibility",
     },
     {"networks", "vector_env"},
-    {"rollout", "learning", "actor_critic", "online", "training", "evaluation"},
+    {"rollout", "learning", "actor_critic", "online", "training", "soundness", "evaluation"},
     {"run", "train", "evaluate", "inspect"},
 ]
 FOREIGN = {0: {"jax"}, 1: {"jax", "flax"}, 2: {"jax", "optax"}}

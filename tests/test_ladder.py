@@ -75,7 +75,7 @@ def advantages(*options):
     random = np.random.default_rng(0)
     reward, value, next_value, squared_score = jnp.asarray(random.uniform(0.5, 2.0, (4, 8, 3)), jnp.float32)
     zero = jnp.zeros((8, 3))
-    steps = Transition(zero, zero, reward, zero, zero.at[3, 0].set(1.0), zero, zero, zero)
+    steps = Transition(zero, zero, reward, zero, zero.at[3, 0].set(1.0), zero, zero, zero, zero)
     method = make_method(configured(*options))
     return np.asarray(method.estimate(steps, method.weight(steps), value, next_value, squared_score).advantage)
 

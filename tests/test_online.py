@@ -122,7 +122,7 @@ def test_update_of_several_environments_is_the_mean_of_theirs():
     random, params, statistics = np.random.default_rng(0), networks.init(jax.random.key(0)), normalization.init(2)
     obs, u, next_obs = (jnp.asarray(random.normal(size=(3, 2)), jnp.float32) for _ in range(3))
     reward, zero = jnp.asarray(random.normal(size=3), jnp.float32), jnp.zeros(3)
-    steps = Transition(obs, u, reward, zero, zero, next_obs, zero, zero)
+    steps = Transition(obs, u, reward, zero, zero, next_obs, zero, zero, zero)
     traces = jax.tree.map(lambda x: jnp.asarray(random.normal(size=(3, *x.shape)), jnp.float32), params)
     traces = Traces(traces["actor"], traces["critic"], jnp.ones(3))
     together, *_ = update(params, traces, statistics, steps)

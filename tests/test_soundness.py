@@ -1,6 +1,7 @@
 """Numbers that explode: the update that made them is not applied, and it is said what was seen first and where."""
 
 import json
+import re
 
 import jax
 import jax.numpy as jnp
@@ -84,7 +85,12 @@ def test_other_policies_are_refused():
 
 
 @pytest.mark.parametrize(
-    ("algo", "policy"), [("td", "stop"), ("td", "skip"), ("ppo", "stop"), ("online", "stop"), ("reinforce", "stop")]
+    ("algo", "policy"),
+    [
+        ("td", "stop"),
+        ("td", "skip"),
+        *(pytest.param(algo, "stop", marks=pytest.mark.study) for algo in ("ppo", "online", "reinforce")),
+    ],
 )
 def test_what_is_sound_is_left_alone(policy, algo):
     """To the bit."""
@@ -217,7 +223,7 @@ def test_each_agent_is_named_once():
 # --- commands ---------------------------------------------------------------------------------------------------------
 
 # Steps of such a size overflow after a while.
-EXPLODES = ("algo=td", "algo.actor_lr=1e37", "algo.final_lr=1")
+EXPLODES = ("algo=td", "algo.critic_lr=1e17", "algo.final_lr=1")
 
 
 @pytest.fixture(scope="module")
@@ -229,7 +235,7 @@ def exploded(command, tmp_path_factory):
 def test_a_run_that_explodes_stops_with_status_4(exploded):
     folder, result = exploded
     assert result.returncode == 4, result.stderr
-    assert "is not finite; stopped at " in result.stdout
+    assert re.search(r"error: update \d+: gradient_norm is not finite; stopped at \d+ steps; resume=", result.stdout)
     assert "Traceback" not in result.stdout + result.stderr
     lines, _, _ = outcome(folder)
     assert all(value is not None for line in lines for name, value in line.items() if name not in ("seconds", "return"))
@@ -242,5 +248,7 @@ def test_with_skip_it_goes_on_from_there(exploded, command):
     again = command("train", f"resume={folder}")
     assert again.returncode == 4, "the same update again"
     assert outcome(folder)[:2] == (before, update)
-    command("train", f"resume={folder}", "nan_policy=skip")
-    assert outcome(folder)[1] >= update
+    result = command("train", f"resume={folder}", "nan_policy=skip")
+    assert "such updates are left out" in result.stdout
+    assert result.returncode == 4
+    assert "no update after it could be applied" in result.stdout, "the parameters are what explodes here"

@@ -16,7 +16,7 @@ from typing import Any
 import jax
 
 from jaxpg.features import num_features
-from jaxpg.run.config import Config
+from jaxpg.run.config import Config, flatten
 from jaxpg.run.errors import UserError
 from jaxpg.run.folder import num_threads
 from jaxpg.run.program import plan
@@ -34,16 +34,32 @@ CGROUPS = (
 
 
 def check(config: Config, env: Any) -> None:
-    """Raises UserError where the run needs more memory than is available."""
-    run, need, have = config.run, needed(config, env), available()
+    """Raises UserError where the run needs more memory than is available; it names the option that takes the most."""
+    need, have = needed(config, env), available()
     if have is None or need <= have:
         return
-    least = needed(dataclasses.replace(config, run=dataclasses.replace(run, num_envs=1)), env)
-    fits = int((run.num_envs - 1) * (have - least) / max(need - least, 1)) + 1  # it is linear in num_envs
-    raise UserError(
-        f"num_envs={run.num_envs} num_steps={run.num_steps}: such a training needs {need / 1e9:,.1f} GB of memory or "
-        f"more, {have / 1e9:,.1f} GB are available: {f'num_envs={fits} would fit' if have > least else 'too little'}"
-    )
+    least = {name: needed(smallest, env) for name, smallest in _smallest(config).items()}
+    name = min(least, key=least.get)
+    value = flatten(config)[name]
+    problem = f"{name}={value}: such a training needs {need / 1e9:,.1f} GB of memory or more, {have / 1e9:,.1f} GB are "
+    fits = ""
+    if name == "num_envs" and have > least[name]:
+        fits = (
+            f"; {name}={int((value - 1) * (have - least[name]) / (need - least[name])) + 1} would fit"  # it is linear
+        )
+    raise UserError(f"{problem}available{fits}")
+
+
+def _smallest(config: Config) -> dict[str, Config]:
+    """The configuration with one of its sizes as small as it can be, by the size's name."""
+    runs = {name: {name: 1} for name in ("num_envs", "num_steps", "num_seeds", "eval_episodes", "log_interval")}
+    found = {
+        name: dataclasses.replace(config, run=dataclasses.replace(config.run, **size)) for name, size in runs.items()
+    }
+    if hasattr(config.network, "widths"):
+        network = dataclasses.replace(config.network, widths=[1 for _ in config.network.widths])
+        found["network.widths"] = dataclasses.replace(config, network=network)
+    return found
 
 
 def needed(config: Config, env: Any) -> int:

@@ -221,7 +221,9 @@ def _train(session: Session, program: Program, state: RunState, compile_seconds:
         log.close()
     steps, again = f"{update * schedule.steps_per_update:,} steps", f"resume={run_folder.path}"
     if watch.nobody_goes_on:
-        display.say(f"error: {watch.problem}; stopped at {steps}; {again} nan_policy=skip leaves it out")
+        skipped = config.run.nan_policy == "skip"
+        advice = "no update after it could be applied" if skipped else f"{again} nan_policy=skip leaves it out"
+        display.say(f"error: {watch.problem}; stopped at {steps}; {advice}")
         return EXPLODED
     if keeper.failed:
         display.say(f"error: the last state, at {steps}, could not be saved; {again} repeats what is lost")

@@ -11,7 +11,7 @@ import time
 import pytest
 from processes import LINES, RUN, outcome, training
 
-FEW, MANY = 3, 100
+FEW, MANY = 1, 100
 
 
 @pytest.fixture(scope="module")
@@ -61,12 +61,12 @@ def await_lines(process, folder, lines):
         time.sleep(0.001)
 
 
-@pytest.mark.parametrize(("name", "status"), [("SIGTERM", 143), ("SIGINT", 130)])
+@pytest.mark.parametrize(("name", "status"), [("SIGTERM", 143), pytest.param("SIGINT", 130, marks=pytest.mark.faults)])
 def test_stopped_politely_several_times(undisturbed, command, command_environment, tmp_path, name, status):
     """Each time it saves what it has, says where, and goes on from there."""
     expected, _, _ = undisturbed
     folder, done = tmp_path / "run", []
-    for lines in (5, 40, 41):
+    for lines in (5, 41):
         with training(command_environment, *RUN, f"run_dir={folder}", "resume=auto") as process:
             await_lines(process, folder, lines)
             process.send_signal(signal.Signals[name])
@@ -81,6 +81,7 @@ def test_stopped_politely_several_times(undisturbed, command, command_environmen
     assert (lines, digest) == (expected[0], expected[2])
 
 
+@pytest.mark.faults
 def test_a_second_sigint_stops_at_once(command_environment, tmp_path):
     """While a chunk of minutes is computed: the first one waits for its end."""
     sizes = ("log_interval=200000000", "total_steps=200000000", "eval_interval=200000000")

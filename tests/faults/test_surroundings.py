@@ -32,7 +32,7 @@ def undisturbed(command, tmp_path_factory):
 VARIABLES = {
     "narrow": {"COLUMNS": "40"},
     "no colour": {"NO_COLOR": "1", "TERM": "dumb"},
-    "ascii": {"LC_ALL": "C", "PYTHONIOENCODING": "ascii", "PYTHONUTF8": "0"},
+    "ascii": {"LC_ALL": "C", "PYTHONIOENCODING": "ascii"},
     "hash seed": {"PYTHONHASHSEED": "1"},
     "time zone": {"TZ": "Pacific/Kiritimati"},
     "no home": {"HOME": "/nonexistent", "XDG_CACHE_HOME": ""},
@@ -43,7 +43,7 @@ VARIABLES = {
 }
 
 
-@pytest.mark.parametrize("name", some(VARIABLES, ["ascii", "no home"]))
+@pytest.mark.parametrize("name", some(VARIABLES, ["ascii"]))
 def test_variables_that_change_no_bit(name, undisturbed, command_environment, tmp_path):
     """Nor do they make noise; the folder's name has a letter that not every terminal can show."""
     variables = {key: value.format(tmp=tmp_path) for key, value in VARIABLES[name].items()}
@@ -84,19 +84,13 @@ def training_state(folder):
     return state
 
 
+@pytest.mark.faults
 def test_one_core_with_the_same_threads(command_environment, undisturbed, tmp_path):
     """The number of XLA's threads is pinned, not taken from the cores that are free."""
     threads = str(len(os.sched_getaffinity(0)))
-    folder = tmp_path / "run"
-    command = [*TRAIN, *RUN, f"run_dir={folder}"]
-    core = {min(os.sched_getaffinity(0))}
-    result = subprocess.run(
-        command,
-        env=command_environment | {"PJRT_NPROC": threads},
-        capture_output=True,
-        check=False,
-        preexec_fn=lambda: os.sched_setaffinity(0, core),
-    )
+    folder, variables = tmp_path / "run", command_environment | {"PJRT_NPROC": threads}
+    command = ["taskset", "--cpu-list", str(min(os.sched_getaffinity(0))), *TRAIN, *RUN, f"run_dir={folder}"]
+    result = subprocess.run(command, env=variables, capture_output=True, check=False)
     assert result.returncode == 0, result.stderr
     assert outcome(folder) == undisturbed[0]
 
@@ -104,7 +98,7 @@ def test_one_core_with_the_same_threads(command_environment, undisturbed, tmp_pa
 # --- output -----------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("end", ["| head -1", "> /dev/full", ">&- 2>&-", "2>&1 | true"])
+@pytest.mark.parametrize("end", some(["| head -1", "> /dev/full", ">&- 2>&-", "2>&1 | true"], ["| head -1"]))
 def test_output_that_nobody_reads(end, undisturbed, command_environment, tmp_path):
     folder = tmp_path / "run"
     line = " ".join([*TRAIN, *RUN, f"run_dir={folder}", end])
@@ -114,22 +108,23 @@ def test_output_that_nobody_reads(end, undisturbed, command_environment, tmp_pat
     assert outcome(folder) == undisturbed[0]
 
 
-def test_a_terminal_that_hangs_up(command_environment, tmp_path):
+@pytest.mark.faults
+@pytest.mark.parametrize("ignored", [False, True])
+def test_a_terminal_that_hangs_up(ignored, command_environment, tmp_path):
     """SIGHUP is a request to stop, as SIGTERM is; under nohup it is nothing."""
-    for ignored in (False, True):
-        folder = tmp_path / f"ignored-{ignored}"
-        before = signal.signal(signal.SIGHUP, signal.SIG_IGN if ignored else signal.SIG_DFL)
-        try:
-            with training(command_environment, *RUN, f"run_dir={folder}") as process:
-                while not (folder / "metrics.jsonl").exists():
-                    time.sleep(0.01)
-                time.sleep(0.1)
-                process.send_signal(signal.SIGHUP)
-                said = process.stdout.read()
-                assert process.wait() == (0 if ignored else 129), said
-        finally:
-            signal.signal(signal.SIGHUP, before)
-        assert ("SIGHUP: stopped at" in said) != ignored
+    folder = tmp_path / "run"
+    before = signal.signal(signal.SIGHUP, signal.SIG_IGN if ignored else signal.SIG_DFL)
+    try:
+        with training(command_environment, *RUN, f"run_dir={folder}") as process:
+            while not (folder / "metrics.jsonl").exists():
+                time.sleep(0.01)
+            time.sleep(0.1)
+            process.send_signal(signal.SIGHUP)
+            said = process.stdout.read()
+            assert process.wait() == (0 if ignored else 129), said
+    finally:
+        signal.signal(signal.SIGHUP, before)
+    assert ("SIGHUP: stopped at" in said) != ignored
 
 
 # --- what is refused --------------------------------------------------------------------------------------------------
@@ -144,7 +139,7 @@ REFUSED = {
 }
 
 
-@pytest.mark.parametrize("name", some(REFUSED, ["no threads", "unknown flag"]))
+@pytest.mark.parametrize("name", some(REFUSED, ["unknown flag"]))
 def test_variables_that_are_refused(name, command_environment, tmp_path):
     variables, message = REFUSED[name]
     command = [*TRAIN, *RUN, f"run_dir={tmp_path / 'run'}"]
@@ -158,6 +153,7 @@ def test_variables_that_are_refused(name, command_environment, tmp_path):
 # --- folders ----------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.faults
 def test_a_link_to_a_folder_elsewhere(undisturbed, command, tmp_path):
     (tmp_path / "elsewhere").mkdir()
     (tmp_path / "link").symlink_to(tmp_path / "elsewhere")
