@@ -168,6 +168,7 @@ def test_gymnasium_plays_the_same_episodes(uninterrupted, command):
     assert abs(answers[0]["mean"] - answers[1]["mean"]) < 4 * spread
 
 
+@pytest.mark.study
 def test_several_seeds_of_the_arm(command, tmp_path):
     folder = tmp_path / "run"
     result = command(

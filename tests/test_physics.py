@@ -158,7 +158,7 @@ def test_other_inputs_and_outputs():
 @pytest.mark.parametrize(
     ("name", "by_mjx"),
     [
-        ("pendulum", True),
+        pytest.param("pendulum", True, marks=pytest.mark.study),
         ("arm, velocity", False),
         pytest.param("arm, velocity", True, marks=pytest.mark.study),
         pytest.param("free body", True, marks=pytest.mark.study),

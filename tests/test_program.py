@@ -128,7 +128,7 @@ def test_settings_in_one_program_are_the_settings_alone():
     jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-4, atol=1e-5), together, trained(*SWEEP))
 
 
-@pytest.mark.parametrize("algo", ["td", "ppo"])
+@pytest.mark.parametrize("algo", ["td", pytest.param("ppo", marks=pytest.mark.study)])
 def test_training_episodes_are_cut_as_by_a_shorter_time_limit(algo):
     """To the bit the training with that limit, where evaluations keep the longer one; and not that without the cut."""
 

@@ -26,10 +26,10 @@ NUMBER = 4  # bytes
 # Of a step of an environment, beside observations and actions: reward, ends, returns, values, advantages, ...
 SCALARS = 5
 METRICS = 16  # numbers that an update reports
-# Where the groups of this process are told their limits, of cgroups in version 2 and 1.
+# Where a container's limit, its use and what of that it can give back are told, by cgroups in version 2 and 1.
 CGROUPS = (
-    ("/sys/fs/cgroup/memory.max", "/sys/fs/cgroup/memory.current"),
-    ("/sys/fs/cgroup/memory/memory.limit_in_bytes", "/sys/fs/cgroup/memory/memory.usage_in_bytes"),
+    ("memory.max", "memory.current", "memory.stat", "inactive_file"),
+    ("memory/memory.limit_in_bytes", "memory/memory.usage_in_bytes", "memory/memory.stat", "total_inactive_file"),
 )
 
 
@@ -40,14 +40,14 @@ def check(config: Config, env: Any) -> None:
         return
     least = {name: needed(smallest, env) for name, smallest in _smallest(config).items()}
     name = min(least, key=least.get)
-    value = flatten(config)[name]
-    problem = f"{name}={value}: such a training needs {need / 1e9:,.1f} GB of memory or more, {have / 1e9:,.1f} GB are "
-    fits = ""
+    value, advice = flatten(config)[name], ""
     if name == "num_envs" and have > least[name]:
-        fits = (
-            f"; {name}={int((value - 1) * (have - least[name]) / (need - least[name])) + 1} would fit"  # it is linear
-        )
-    raise UserError(f"{problem}available{fits}")
+        share = (have - least[name]) / (need - least[name])  # what is needed is linear in num_envs
+        advice = f"; num_envs={int((value - 1) * share) + 1} would fit"
+    raise UserError(
+        f"{name}={value}: such a training needs {need / 1e9:,.1f} GB of memory or more, "
+        f"{have / 1e9:,.1f} GB are available{advice}"
+    )
 
 
 def _smallest(config: Config) -> dict[str, Config]:
@@ -98,9 +98,11 @@ def _limits() -> Iterator[int]:
     with contextlib.suppress(OSError, ValueError):
         fields = dict(line.split(":") for line in Path("/proc/meminfo").read_text().splitlines())
         yield 1024 * int(fields["MemAvailable"].split()[0])
-    for limit, usage in CGROUPS:
-        with contextlib.suppress(OSError, ValueError):  # "max" is no number, and no limit
-            yield max(int(Path(limit).read_text()) - int(Path(usage).read_text()), 0)
+    for *paths, name in CGROUPS:
+        with contextlib.suppress(OSError, ValueError, KeyError):  # "max" is no number, and no limit
+            limit, usage, details = (Path("/sys/fs/cgroup", path).read_text() for path in paths)
+            cached = int(dict(line.split() for line in details.splitlines())[name])
+            yield max(int(limit) - int(usage) + cached, 0)
     soft, _ = resource.getrlimit(resource.RLIMIT_AS)
     if soft != resource.RLIM_INFINITY:
         yield soft

@@ -6,6 +6,7 @@ import dataclasses
 import importlib
 import time
 from collections.abc import Callable, Iterable, Mapping
+from signal import Signals
 from typing import Any, NamedTuple
 
 import jax
@@ -219,24 +220,34 @@ def _train(session: Session, program: Program, state: RunState, compile_seconds:
     finally:
         display.stop()
         log.close()
-    steps, again = f"{update * schedule.steps_per_update:,} steps", f"resume={run_folder.path}"
-    if watch.nobody_goes_on:
-        skipped = config.run.nan_policy == "skip"
-        advice = "no update after it could be applied" if skipped else f"{again} nan_policy=skip leaves it out"
-        display.say(f"error: {watch.problem}; stopped at {steps}; {advice}")
-        return EXPLODED
-    if keeper.failed:
-        display.say(f"error: the last state, at {steps}, could not be saved; {again} repeats what is lost")
-        return NOT_SAVED
-    if solved:
-        display.say(f"reached stop_return={config.run.stop_return:g} after {steps}")
-    elif update < schedule.num_updates:
-        display.say(f"{stop.signal.name}: stopped at {steps}; {again} goes on")
-        return 128 + stop.signal
+    status, text = _ending(session, update, watch, keeper, solved, stop.signal)
+    if text:
+        display.say(text)
+    if status:
+        return status
     training_seconds = time.monotonic() - began
     rate = (update - first) * schedule.steps_per_update * config.num_agents / training_seconds
     _show_results(session, rate, compile_seconds, training_seconds)
     return 0
+
+
+def _ending(
+    session: Session, update: int, watch: Watch, keeper: Keeper, solved: bool, stopped: Signals | None
+) -> tuple[int, str | None]:
+    """The exit status of a run that ended after `update` updates, and what is to be said of it."""
+    run, schedule = session.config.run, session.schedule
+    steps, again = f"{update * schedule.steps_per_update:,} steps", f"resume={session.run_folder.path}"
+    if watch.nobody_goes_on:
+        skipped = run.nan_policy == "skip"
+        advice = "no update after it could be applied" if skipped else f"{again} nan_policy=skip leaves it out"
+        return EXPLODED, f"error: {watch.problem}; stopped at {steps}; {advice}"
+    if keeper.failed:
+        return NOT_SAVED, f"error: the last state, at {steps}, could not be saved; {again} repeats what is lost"
+    if solved:
+        return 0, f"reached stop_return={run.stop_return:g} after {steps}"
+    if stopped and update < schedule.num_updates:
+        return 128 + stopped, f"{stopped.name}: stopped at {steps}; {again} goes on"
+    return 0, None
 
 
 def _show_results(session: Session, rate: float, compile_seconds: float, training_seconds: float) -> None:

@@ -61,7 +61,8 @@ def await_lines(process, folder, lines):
         time.sleep(0.001)
 
 
-@pytest.mark.parametrize(("name", "status"), [("SIGTERM", 143), pytest.param("SIGINT", 130, marks=pytest.mark.faults)])
+@pytest.mark.faults
+@pytest.mark.parametrize(("name", "status"), [("SIGTERM", 143), ("SIGINT", 130)])
 def test_stopped_politely_several_times(undisturbed, command, command_environment, tmp_path, name, status):
     """Each time it saves what it has, says where, and goes on from there."""
     expected, _, _ = undisturbed
