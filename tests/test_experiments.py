@@ -39,9 +39,6 @@ def experiments(monkeypatch, command_environment, tmp_path):
         sys.modules.pop(name, None)
 
 
-SHORT = ("total_steps=64", "num_envs=8", "num_steps=4", "eval_episodes=2")
-
-
 def test_default_runs(experiments, monkeypatch):
     import default_runs
 
@@ -50,8 +47,6 @@ def test_default_runs(experiments, monkeypatch):
     monkeypatch.setattr(
         default_runs, "evaluate", lambda folder, *options: {"mean": -1.0, "stderr": 0.1, "success": 0.5}
     )
-    train = default_runs.train
-    monkeypatch.setattr(default_runs, "train", lambda *arguments: train(*arguments, *SHORT))
     default_runs.main([])
     rows = json.loads((experiments / "default_runs_arm.json").read_text())
     assert rows[0]["within_2cm"] == 0.5
