@@ -11,7 +11,7 @@ import pytest
 
 from jaxpg.run.checkpoint import CheckpointError, Checkpoints
 
-FEW, MANY = 20, 200
+FEW, MANY = range(20, 40), 200  # 27 is one that only the digests of the arrays tell
 STEPS = (1, 2, 3)
 
 
@@ -87,7 +87,7 @@ def files(folder):
 
 
 @pytest.mark.parametrize(
-    "seed", [pytest.param(seed, marks=[pytest.mark.faults] if seed >= FEW else []) for seed in range(MANY)]
+    "seed", [pytest.param(seed, marks=[] if seed in FEW else [pytest.mark.faults]) for seed in range(MANY)]
 )
 def test_random_damages(saved, tmp_path, seed):
     """One to four files of the two newest of three: the newest that is sound is read, as it was written."""
