@@ -61,6 +61,7 @@ class Checkpoints:
         self._failed = False
 
     def _open(self) -> ocp.CheckpointManager:
+        _silence_what_is_left_behind()
         try:
             return ocp.CheckpointManager(self.folder, item_names=("state", "meta"), options=self._options)
         except Exception as error:
@@ -149,9 +150,12 @@ class Checkpoints:
           CheckpointError: it cannot be read.
         """
         record = self._read(step, meta=ocp.args.JsonRestore())["meta"]
-        if not isinstance(record, dict) or not {"step", "meta", "leaves"} <= record.keys():
-            raise CheckpointError(f"{self.folder / str(step)}: damaged, its record is not one of ours")
-        return record
+        try:
+            _kinds(record["leaves"])
+            return {name: record[name] for name in ("step", "meta", "leaves")}
+        except (TypeError, ValueError, KeyError, AttributeError) as error:  # JSON all the same, after a flipped bit
+            problem = f"{self.folder / str(step)}: damaged, its record is not one of ours ({_reason(error)})"
+            raise CheckpointError(problem) from error
 
     def read(self, step: int) -> dict[str, np.ndarray]:
         """Every leaf of checkpoint `step` by its name, verified; random keys as the numbers that they are stored as.
@@ -163,7 +167,7 @@ class Checkpoints:
         if record["step"] != step:
             raise CheckpointError(f"{self.folder / str(step)}: damaged, it is what was saved as {record['step']}")
         recorded = record["leaves"]
-        kinds = {name: jax.ShapeDtypeStruct(shape, dtype) for name, (shape, dtype, _) in recorded.items()}
+        kinds = _kinds(recorded)
         stored = {name: kind for name, kind in kinds.items() if kind.size}
         restored = self._read(step, state=ocp.args.StandardRestore(stored))["state"]
         leaves = {
@@ -243,8 +247,18 @@ def _silence_what_is_left_behind() -> None:
             report(unraisable)
 
     sys.unraisablehook = hook
-    for name, words in (("absl", "_SignalingThread.run() raised"), ("asyncio", "exception was never retrieved")):
+    silenced = (
+        ("absl", "_SignalingThread.run() raised"),
+        ("absl", "etadata file"),  # of a checkpoint that a kill has half removed: it is read, or named, all the same
+        ("asyncio", "exception was never retrieved"),
+    )
+    for name, words in silenced:
         logging.getLogger(name).addFilter(lambda record, words=words: words not in record.getMessage())
+
+
+def _kinds(recorded: Mapping[str, Any]) -> dict[str, jax.ShapeDtypeStruct]:
+    """Shape and type of each recorded leaf."""
+    return {name: jax.ShapeDtypeStruct(shape, dtype) for name, (shape, dtype, _) in recorded.items()}
 
 
 def _host_leaves(tree: PyTree) -> dict[str, np.ndarray]:
