@@ -33,8 +33,9 @@ def prepare(config: Config, threads: int | None = None) -> None:
     os.environ["PJRT_NPROC"] = str(threads or num_threads())
     try:
         jax.devices()
-    except RuntimeError as error:
-        raise UserError(f"JAX_PLATFORMS={jax.config.jax_platforms}: {str(error).splitlines()[0]}") from error
+    except (RuntimeError, AssertionError) as error:  # the latter, without words, where jax has no plugin for it
+        reason = (str(error).splitlines() or ["there is no such platform here; cpu is one"])[0]
+        raise UserError(f"JAX_PLATFORMS={jax.config.jax_platforms}: {reason}") from error
 
 
 def _check_variables() -> None:

@@ -36,7 +36,7 @@ VARIABLES = {
     "hash seed": {"PYTHONHASHSEED": "1"},
     "time zone": {"TZ": "Pacific/Kiritimati"},
     "no home": {"HOME": "/nonexistent", "XDG_CACHE_HOME": ""},
-    "no cache": {"XDG_CACHE_HOME": "/proc/nothing"},
+    "no cache": {"XDG_CACHE_HOME": "/proc/nothing", "MPLCONFIGDIR": "{tmp}"},  # matplotlib would speak of its own
     "one OpenMP thread": {"OMP_NUM_THREADS": "1"},
     "synchronous": {"JAX_CPU_ENABLE_ASYNC_DISPATCH": "false"},
     "own cache of jax": {"JAX_COMPILATION_CACHE_DIR": "{tmp}/jax"},
