@@ -46,6 +46,7 @@ def exploding(what, value, at=BAD):
         params, opt_state, normalizer = state.params + 1 + add["parameter"], state.opt_state + 1, state.normalizer + 1
         obs = (state.env_state.obs + 1).at[1, 2].add(add["observation"])
         metrics = {name: jnp.ones(()) + (bad if name == what else 0.0) for name in ("gradient_norm", "value_loss")}
+        metrics |= {"episodes": jnp.zeros(()), "diverged": jnp.zeros(()), "diverged_env": -jnp.ones((), jnp.int32)}
         return TrainState(params, opt_state, normalizer, Envs(obs), update), metrics
 
     return Algorithm(init, step)
@@ -77,6 +78,17 @@ def test_skip_learns_nothing_from_the_update_and_goes_on(what):
     np.testing.assert_array_equal(state.env_state.obs, learned if what == "observation" else 7)
     assert state.update == 7
     assert (metrics["unsound"] > 0).tolist() == [update == BAD for update in range(1, 8)]
+
+
+@pytest.mark.parametrize("what", WHATS)
+def test_what_exploded_is_named_as_it_is(what):
+    """The place that the program counts is found again among the metrics' names."""
+    state, metrics = train_scan(sound(exploding(what, jnp.nan)), KEY, 5)
+    watch = Watch(compose([]), print)
+    watch.look(state._replace(update=np.zeros(1, int)), {name: np.asarray(x)[None] for name, x in metrics.items()})
+    where = " of environment 1" if what == "observation" else ""
+    assert watch.problem == f"update {BAD}: {what}{where} is not finite"
+    assert not watch.nobody_goes_on
 
 
 def test_other_policies_are_refused():
@@ -209,7 +221,7 @@ def test_each_agent_is_named_once():
     metrics = {name: np.asarray(value) for name, value in METRICS.items()}
     for _ in range(2):
         watch.look(state, metrics)
-    names = quantities(set(METRICS) - {"diverged_env"})
+    names = quantities(METRICS)
     assert said == [
         f"note: update 12: {names[2]} is not finite, seed 7; such updates are left out",
         f"note: update 11: {names[1]} is not finite, seed 8; such updates are left out",
@@ -235,7 +247,7 @@ def exploded(command, tmp_path_factory):
 def test_a_run_that_explodes_stops_with_status_4(exploded):
     folder, result = exploded
     assert result.returncode == 4, result.stderr
-    assert re.search(r"error: update \d+: gradient_norm is not finite; stopped at \d+ steps; resume=", result.stdout)
+    assert re.search(r"error: update \d+: value_loss is not finite; stopped at \d+ steps; resume=", result.stdout)
     assert "Traceback" not in result.stdout + result.stderr
     lines, _, _ = outcome(folder)
     assert all(value is not None for line in lines for name, value in line.items() if name not in ("seconds", "return"))

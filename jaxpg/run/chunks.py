@@ -83,7 +83,7 @@ class Watch:
     def _note(self, agent: int, first_update: int, metrics: Metrics) -> None:
         codes = np.asarray(metrics["unsound"])[agent]
         at = int(np.argmax(codes > 0))
-        what = quantities(set(metrics) - set(FLAGS))[codes[at] - 1]
+        what = quantities(metrics)[codes[at] - 1]
         environment = int(np.asarray(metrics["unsound_env"])[agent, at])
         where = f" of environment {environment}" if environment >= 0 else ""
         problem = f"update {first_update + at:,}: {what}{where} is not finite{self._of(agent)}"
