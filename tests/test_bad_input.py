@@ -90,6 +90,7 @@ MISTAKES = {
         ["num_envs=100000000", "num_steps=30"],
         "num_envs=100000000 num_steps=30: their product must stay below 2**31",
     ),
+    "environments beyond 32 bits": (["num_envs=1000000000000"], "must be at least 1, at most 2147483647"),
     "updates beyond 32 bits": (
         ["num_envs=1", "num_steps=1", "total_steps=1e12"],
         "total_steps=1000000000000: with 1 steps an update it must stay below 2147483647",

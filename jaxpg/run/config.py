@@ -9,6 +9,7 @@ on it, and else from the dataclasses.
 from __future__ import annotations
 
 import dataclasses
+import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -18,7 +19,7 @@ import envs
 from envs.options import OptionError, build, unknown
 from jaxpg.run import sweep as sweeping
 from jaxpg.run.errors import UserError
-from jaxpg.run.schema import GROUPS, Gaussian, Run, option_fields
+from jaxpg.run.schema import GROUPS, LARGEST, Gaussian, Run, option_fields
 
 DEFAULT_CHOICES = {"env": "pendulum", "algo": "td", "network": "mlp"}  # algo: the first that the environment has tuned
 FOLDERS = ("run_dir", "resume", "run")  # options whose value is a path
@@ -144,7 +145,8 @@ def _conflicts_of_sizes(run: Run) -> Iterator[str]:
 
 
 def _nearest_divisor(number: int, to: int) -> int:
-    return min((n for n in range(1, number + 1) if number % n == 0), key=lambda n: abs(n - to))
+    small = [n for n in range(1, math.isqrt(number) + 1) if number % n == 0]
+    return min(sorted({*small, *(number // n for n in small)}), key=lambda n: abs(n - to))
 
 
 def compose(arguments: Sequence[str]) -> Config:
@@ -201,7 +203,7 @@ def _tunable(tuned: Mapping[str, Any], choices: Mapping[str, str]) -> set[str]:
 
 def _fitting(tuned: Mapping[str, Any], num_envs: Any) -> Mapping[str, Any]:
     """The tuned values with a number of minibatches that divides the environments asked for."""
-    if "algo.minibatches" not in tuned or not isinstance(num_envs, int) or num_envs < 1:
+    if "algo.minibatches" not in tuned or not isinstance(num_envs, int) or not 1 <= num_envs <= LARGEST:
         return tuned
     return {**tuned, "algo.minibatches": _nearest_divisor(num_envs, tuned["algo.minibatches"])}
 

@@ -18,6 +18,8 @@ from jaxpg.features import FEATURES
 from jaxpg.networks import ACTIVATIONS, SIGMAS
 from jaxpg.soundness import POLICIES
 
+LARGEST = 2**31 - 1  # size of an array's axis: XLA's indices are 32-bit numbers
+
 
 def number(default: float | None, help: str, **bounds: float) -> Any:
     """An option whose value only enters formulas: the program can take it as an argument, so that it can be swept.
@@ -132,10 +134,13 @@ class Run:
 
     seed: int = option(0, "random seed", at_least=0, at_most=2**32 - 1)
     num_seeds: int = option(
-        1, "agents trained at once (of each setting of a sweep), with seeds seed, seed + 1, ...", at_least=1
+        1,
+        "agents trained at once (of each setting of a sweep), with seeds seed, seed + 1, ...",
+        at_least=1,
+        at_most=LARGEST,
     )
     vmap_seeds: int = option(1, "of all agents in one program; on a CPU programs of one agent are faster", at_least=1)
-    num_envs: int = option(64, "environments of each agent", at_least=1)
+    num_envs: int = option(64, "environments of each agent", at_least=1, at_most=LARGEST)
     num_steps: int | None = option(None, "steps of a rollout (td); reinforce plays whole episodes", at_least=1)
     total_steps: int = option(1_000_000, "environment steps to train for, of each agent", at_least=1)
     log_interval: int = option(50_000, "environment steps between two lines of metrics", at_least=1)
