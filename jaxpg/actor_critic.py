@@ -21,7 +21,7 @@ from jaxpg.networks import Networks
 from jaxpg.returns import discount_factors
 from jaxpg.rollout import PolicyFn, rollout
 from jaxpg.types import Algorithm, Metrics, PyTree, TrainState, Transition
-from jaxpg.vector_env import VectorEnv, VectorState, divergence, stagger
+from jaxpg.vector_env import VectorEnv, VectorState, episode_metrics, stagger
 
 
 class Method(NamedTuple):
@@ -173,11 +173,7 @@ def actor_critic(
         normalizer = state.normalizer
         if normalize_observations:
             normalizer = normalization.update(normalizer, transition.obs)
-        metrics = metrics | {
-            "return_sum": jnp.sum(transition.episode_return),
-            "episodes": jnp.sum(transition.episode_end),
-        }
-        metrics |= divergence(transition)
+        metrics = metrics | episode_metrics(transition)
         return TrainState(params, opt_state, normalizer, env_state, state.update + 1), metrics
 
     return Algorithm(init, step)

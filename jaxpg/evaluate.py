@@ -10,7 +10,6 @@ from envs.options import build
 from jaxpg.run import config, help
 from jaxpg.run.errors import UserError, run_command
 from jaxpg.run.schema import EvaluateOptions
-from jaxpg.run.sweep import described
 
 
 def main(arguments: Sequence[str]) -> int:
@@ -33,8 +32,7 @@ def main(arguments: Sequence[str]) -> int:
         returns, metrics = play(stored, options.episodes, options.seed)
     mean, stderr = returns.mean(), returns.std(ddof=1) / math.sqrt(len(returns))
     saved = f"{options.checkpoint} policy (saved after {stored.update:,} updates)"
-    agent = f"seed {stored.config.run.seed} {described(stored.setting)}".strip()
-    print(f"{stored.config.choices['env']}, {agent}, {saved}, {options.backend}")
+    print(f"{stored.config.choices['env']}, {stored.agent}, {saved}, {options.backend}")
     print(f"return   {mean:.2f} +- {stderr:.2f} (mean and standard error, {len(returns)} episodes)")
     for metric, values in metrics.items():
         print(

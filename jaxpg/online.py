@@ -18,7 +18,7 @@ from jaxpg.returns import td_errors
 from jaxpg.rollout import rollout
 from jaxpg.shapes import along
 from jaxpg.types import Algorithm, Metrics, PyTree, TrainState, Transition
-from jaxpg.vector_env import VectorEnv, divergence, stagger
+from jaxpg.vector_env import VectorEnv, episode_metrics, stagger
 
 
 class Traces(NamedTuple):
@@ -106,11 +106,7 @@ def online_actor_critic(
         normalizer = state.normalizer
         if normalize_observations:
             normalizer = normalization.update(normalizer, transition.obs)
-        metrics = jax.tree.map(jnp.mean, metrics) | {
-            "return_sum": jnp.sum(transition.episode_return),
-            "episodes": jnp.sum(transition.episode_end),
-        }
-        metrics |= divergence(transition)
+        metrics = jax.tree.map(jnp.mean, metrics) | episode_metrics(transition)
         return TrainState(params, traces, normalizer, env_state, state.update + 1), metrics
 
     return Algorithm(init, step)

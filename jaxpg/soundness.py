@@ -10,6 +10,7 @@ import jax.numpy as jnp
 from jaxpg.types import Algorithm, Metrics, PyTree, TrainState
 
 POLICIES = ("stop", "skip")
+FLAGS = ("unsound", "unsound_env")  # the metrics that `sound` adds
 
 
 def sound(algorithm: Algorithm, policy: str = "stop") -> Algorithm:
@@ -62,7 +63,7 @@ def quantities(metrics: Iterable[str]) -> list[str]:
 
 
 def _in_order(metrics: Iterable[str]) -> list[str]:
-    return sorted(set(metrics) - {"unsound", "unsound_env"}, key=lambda name: (name == "gradient_norm", name))
+    return sorted(set(metrics) - set(FLAGS), key=lambda name: (name == "gradient_norm", name))
 
 
 def _each_finite(obs: jax.Array) -> jax.Array:

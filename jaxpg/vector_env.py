@@ -113,10 +113,16 @@ def stagger(state: VectorState, key: jax.Array, episode_length: int) -> VectorSt
     return state._replace(time=time, whole=(time == 0).astype(state.whole.dtype))
 
 
-def divergence(transition: Transition) -> Metrics:
-    """`diverged`, how often the physics did in a rollout, and `diverged_env`, the first environment with it, or -1."""
+def episode_metrics(transition: Transition) -> Metrics:
+    """What a rollout says of its episodes.
+
+    `episodes` that ended and `return_sum`, the sum of their returns; `diverged`, how often the physics did, and
+    `diverged_env`, the first environment with it, or -1.
+    """
     where = jnp.any(transition.diverged > 0, axis=0)
     return {
+        "return_sum": jnp.sum(transition.episode_return),
+        "episodes": jnp.sum(transition.episode_end),
         "diverged": jnp.sum(transition.diverged),
         "diverged_env": jnp.where(jnp.any(where), jnp.argmax(where), -1).astype(jnp.int32),
     }

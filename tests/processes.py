@@ -30,13 +30,20 @@ def training(environment, *arguments):
             process.kill()
 
 
+def has_written(process, folder, lines):
+    """Waits until the process has written so many lines of metrics; whether it has before it ended."""
+    log, deadline = folder / "metrics.jsonl", time.monotonic() + 300
+    while not (log.exists() and log.read_bytes().count(b"\n") >= lines):
+        if process.poll() is not None:
+            return False
+        assert time.monotonic() < deadline
+        time.sleep(0.001)
+    return True
+
+
 def stop_after(process, folder, lines):
     """Stops the process when it has written so many lines of metrics; `proceed` lets it go on."""
-    log, deadline = folder / "metrics.jsonl", time.monotonic() + 300
-    while not (log.exists() and log.read_text().count("\n") >= lines):
-        assert process.poll() is None, process.stdout.read()
-        assert time.monotonic() < deadline
-        time.sleep(0.002)
+    assert has_written(process, folder, lines), process.stdout.read()
     process.send_signal(signal.SIGSTOP)
     os.waitid(os.P_PID, process.pid, os.WSTOPPED | os.WNOWAIT)
 

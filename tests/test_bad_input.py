@@ -5,6 +5,7 @@ import shutil
 import sys
 
 import pytest
+from processes import tree
 
 from jaxpg import evaluate, train
 from jaxpg.run import cache
@@ -174,11 +175,6 @@ def finished(command, tmp_path_factory):
     sizes = ("num_envs=2", "num_steps=2", "total_steps=4", "eval_episodes=2", "env.episode_length=4")
     assert command("train", *sizes, f"run_dir={folder}").returncode == 0
     return folder
-
-
-def tree(folder):
-    """All files below a folder with their contents."""
-    return {path.relative_to(folder): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
 
 
 RUN_MISTAKES = {

@@ -6,10 +6,10 @@ import shutil
 import signal
 import subprocess
 import sys
-import time
 
 import numpy as np
 import pytest
+from processes import has_written
 
 from jaxpg.run.checkpoint import Checkpoints
 
@@ -87,12 +87,7 @@ def test_stopped_and_resumed_is_never_stopped(
         env=command_environment,
         stdout=subprocess.DEVNULL,
     ) as process:
-        log = folder / "metrics.jsonl"
-        deadline = time.monotonic() + 300
-        while not (log.exists() and log.read_text().count("\n") >= after):
-            assert process.poll() is None, "the run ended before it could be stopped"
-            assert time.monotonic() < deadline
-            time.sleep(0.002)
+        assert has_written(process, folder, after), "the run ended before it could be stopped"
         process.send_signal(signal.Signals[stop])
         assert process.wait(timeout=60) == status
     assert len(metrics(folder)) < LINES

@@ -8,9 +8,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from jaxpg.run import sweep
 from jaxpg.run.config import Config
 from jaxpg.run.sweep import Setting, settings
-from jaxpg.run.sweep import described as words
 
 
 class Agents(NamedTuple):
@@ -67,7 +67,7 @@ def alone(config: Config, agent: int) -> Config:
 
 def described_agent(config: Config, agent: int) -> str:
     """One agent in words, such as `seed 3 algo.gamma=0.9`."""
-    return f"seed {config.run.seed + agent % config.run.num_seeds} {words(setting_of(config, agent))}".strip()
+    return f"seed {alone(config, agent).run.seed} {sweep.described(setting_of(config, agent))}".strip()
 
 
 def described(config: Config) -> str:

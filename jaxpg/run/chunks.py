@@ -10,11 +10,10 @@ import numpy as np
 from jaxpg.run.agents import described_agent
 from jaxpg.run.config import Config
 from jaxpg.run.folder import jsonable
-from jaxpg.soundness import quantities
+from jaxpg.soundness import FLAGS, quantities
 from jaxpg.types import Metrics, TrainState
 
-# Numbers of an update that are no measurements: see `jaxpg.soundness.sound` and `jaxpg.vector_env.divergence`.
-FLAGS = ("unsound", "unsound_env", "diverged_env")
+NO_MEASUREMENTS = (*FLAGS, "diverged_env")
 
 
 def summary(metrics: Metrics) -> dict[str, Any]:
@@ -29,7 +28,7 @@ def summary(metrics: Metrics) -> dict[str, Any]:
     """
     values = {name: np.asarray(value, np.float64) for name, value in metrics.items()}
     unsound = values["unsound"] > 0
-    values = {name: np.where(unsound, np.nan, value) for name, value in values.items() if name not in FLAGS}
+    values = {name: np.where(unsound, np.nan, value) for name, value in values.items() if name not in NO_MEASUREMENTS}
     sums = {name: np.nansum(values.pop(name), axis=-1) for name in ("return_sum", "episodes", "diverged")}
     mean_return = np.where(sums["episodes"] > 0, sums["return_sum"] / np.maximum(sums["episodes"], 1), np.nan)
     counts = {"skipped": unsound.sum(axis=-1), "diverged": sums["diverged"]}

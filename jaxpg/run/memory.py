@@ -68,20 +68,21 @@ def needed(config: Config, env: Any) -> int:
     It is an estimate from below: XLA may keep more.
     """
     run, network, online = config.run, config.network, config.choices["algo"] == "online"
-    features = num_features(network.features, env.observation_size, network.order)
+    state = jax.eval_shape(env.reset, jax.random.key(0))
+    of_env, observation_size = num_bytes(state), state.obs.shape[-1]
+    features = num_features(network.features, observation_size, network.order)
     widths = [features, *getattr(network, "widths", ())]
     params = NUMBER * 2 * (sum(a * b for a, b in itertools.pairwise(widths)) + widths[-1] * env.action_size)
-    of_env = num_bytes(jax.eval_shape(env.reset, jax.random.key(0)))
     # Of Adam there are two further numbers for each parameter; of traces one in each environment.
-    state = params * (run.num_envs if online else 3) + of_env * run.num_envs
+    agent = params * (run.num_envs if online else 3) + of_env * run.num_envs
     # A rollout as it was played, and the batch that is made of it, with what its gradients pass through.
     hidden = 2 * sum(widths[1:]) // getattr(config.algo, "minibatches", 1)
-    step = 2 * env.observation_size + features + 2 * env.action_size + SCALARS + hidden
+    step = 2 * observation_size + features + 2 * env.action_size + SCALARS + hidden
     rollout = 0 if online else NUMBER * step * run.num_steps * run.num_envs
     episodes = of_env * run.eval_episodes
     chunk = NUMBER * METRICS * plan(config).chunk
     at_once = min(config.num_agents, run.vmap_seeds * num_threads())
-    return (state + chunk) * (config.num_agents + at_once) + max(rollout, episodes) * at_once
+    return (agent + chunk) * (config.num_agents + at_once) + max(rollout, episodes) * at_once
 
 
 def num_bytes(tree: PyTree) -> int:

@@ -11,13 +11,12 @@ import numpy as np
 from jaxpg.actor_critic import deterministic_policy
 from jaxpg.run import config as configuration
 from jaxpg.run import folder
-from jaxpg.run.agents import alone, setting_of
+from jaxpg.run.agents import alone, described_agent
 from jaxpg.run.checkpoint import Checkpoints
 from jaxpg.run.config import Config
 from jaxpg.run.errors import UserError
 from jaxpg.run.program import make_algorithm, make_env, make_networks, state_shape
 from jaxpg.run.state import Policy, current_policy
-from jaxpg.run.sweep import Setting
 
 
 class StoredPolicy(NamedTuple):
@@ -28,7 +27,7 @@ class StoredPolicy(NamedTuple):
       policy: its parameters; an argument of `act`, so that all policies of a kind are one compiled program.
       env: the environment, with the changes asked for.
       config: of the agent as a run of its own, with the changes.
-      setting: of the agent; empty without a sweep.
+      agent: in words, such as "seed 3".
       update: updates made when the checkpoint was written.
     """
 
@@ -36,7 +35,7 @@ class StoredPolicy(NamedTuple):
     policy: Policy
     env: Any
     config: Config
-    setting: Setting
+    agent: str
     update: int
 
 
@@ -73,7 +72,7 @@ def load(
     def act(policy, obs):
         return deterministic_policy(networks, policy.params, policy.normalizer)(obs)
 
-    return StoredPolicy(act, policy, env, alone(config, agent), setting_of(config, agent), update)
+    return StoredPolicy(act, policy, env, alone(config, agent), described_agent(config, agent), update)
 
 
 def _restore(checkpoints: Checkpoints, template: Any, run: str) -> tuple[Any, int]:

@@ -52,8 +52,8 @@ def _check_variables() -> None:
         ended = subprocess.run(attempt, capture_output=True, text=True, check=False)
         if ended.returncode:
             lines = [line for line in ended.stderr.splitlines() if "flag" in line.lower()]
-            reason = lines[0].partition("] ")[2] if lines else f"status {ended.returncode}"
-            raise UserError(f"XLA_FLAGS={flags}: XLA does not start with it ({reason or lines[0]})")
+            reason = lines[0].rpartition("] ")[2] if lines else f"status {ended.returncode}"
+            raise UserError(f"XLA_FLAGS={flags}: XLA does not start with it ({reason})")
 
 
 class StopRequests:

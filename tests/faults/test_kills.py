@@ -9,7 +9,7 @@ import signal
 import time
 
 import pytest
-from processes import LINES, RUN, outcome, training
+from processes import LINES, RUN, has_written, outcome, training
 
 FEW, MANY = 1, 100
 
@@ -40,7 +40,7 @@ def test_killed_at_a_random_moment(undisturbed, command, command_environment, tm
         if seed % 3 == 2:
             time.sleep(moment.uniform(0, lifetime))
         else:
-            await_lines(process, folder, moment.randrange(LINES))
+            has_written(process, folder, moment.randrange(LINES))
             time.sleep(moment.uniform(0, 0.02))
         process.send_signal(signal.SIGKILL)
         process.wait()
@@ -52,15 +52,6 @@ def test_killed_at_a_random_moment(undisturbed, command, command_environment, tm
     assert outcome(folder, "best") == expected_best
 
 
-def await_lines(process, folder, lines):
-    log, deadline = folder / "metrics.jsonl", time.monotonic() + 300
-    while not (log.exists() and log.read_bytes().count(b"\n") >= lines):
-        if process.poll() is not None:
-            return
-        assert time.monotonic() < deadline
-        time.sleep(0.001)
-
-
 @pytest.mark.faults
 @pytest.mark.parametrize(("name", "status"), [("SIGTERM", 143), ("SIGINT", 130)])
 def test_stopped_politely_several_times(undisturbed, command, command_environment, tmp_path, name, status):
@@ -69,7 +60,7 @@ def test_stopped_politely_several_times(undisturbed, command, command_environmen
     folder, done = tmp_path / "run", []
     for lines in (5, 41):
         with training(command_environment, *RUN, f"run_dir={folder}", "resume=auto") as process:
-            await_lines(process, folder, lines)
+            has_written(process, folder, lines)
             process.send_signal(signal.Signals[name])
             said = process.stdout.read()
             assert process.wait(timeout=60) == status, said
