@@ -74,6 +74,7 @@ TRAINING = {
         "eval_interval": 500_000,
         "checkpoint_interval": 2_000_000,
         "algo.epochs": 4,
+        "algo.num_shards": 2,
         "algo.minibatches": 8,
         "algo.actor_lr": 0.004,
         "algo.critic_lr": 0.008,

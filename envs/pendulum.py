@@ -43,6 +43,7 @@ TRAINING = {
         "total_steps": 490_000,
         "log_interval": 50_000,
         "eval_interval": 50_000,
+        "algo.num_shards": 2,
         "algo.minibatches": 8,
         "algo.actor_lr": 0.005,
         "algo.critic_lr": 0.01,

@@ -13,7 +13,7 @@ import jax
 import jax.numpy as jnp
 import optax
 
-from jaxpg import baselines, estimators, normalization
+from jaxpg import baselines, collectives, estimators, normalization
 from jaxpg.distributions import gaussian_sample
 from jaxpg.estimators import Estimate
 from jaxpg.learning import Batch, Reuse, actor_critic_loss, one_step, several_steps
@@ -131,6 +131,7 @@ def actor_critic(
     entropy_coef: float = 0.0,
     normalize_observations: bool = True,
     normalize_advantages: bool = True,
+    axis_name: str | None = None,
 ) -> Algorithm:
     """Policy-gradient training of an actor and a critic, one or several gradient steps for each rollout.
 
@@ -144,14 +145,16 @@ def actor_critic(
       entropy_coef: weight of the policy's entropy; of a squashed one estimated by its samples.
       normalize_observations: feed the networks (s - mean) / std with running statistics, updated after each step.
       normalize_advantages: mean 0 and standard deviation 1 over the rollout.
+      axis_name: a mapped axis, along which further parts of the agent's environments are (`jaxpg.shards`); not with
+        `reinforce`, whose baselines and masks are of one part.
 
     Returns:
       `Algorithm(init, step)`; metrics are scalars, of which `return_sum`, `episodes` and `diverged` are to be summed
       over updates and the others averaged.
     """
-    prepare = batch_of(networks, method, env.episode_length, reward_scale, normalize_advantages)
+    prepare = batch_of(networks, method, env.episode_length, reward_scale, normalize_advantages, axis_name)
     loss = actor_critic_loss(networks, entropy_coef, reuse)
-    learn = one_step(loss, optimizer) if reuse is None else several_steps(loss, optimizer, reuse)
+    learn = one_step(loss, optimizer, axis_name) if reuse is None else several_steps(loss, optimizer, reuse, axis_name)
 
     def init(key: jax.Array) -> TrainState:
         key_params, key_env = jax.random.split(key)
@@ -160,32 +163,38 @@ def actor_critic(
             params=params,
             opt_state=optimizer.init(params),
             normalizer=normalization.init(env.observation_size),
-            env_state=method.start(env, key_env),
+            env_state=method.start(env, collectives.own(key_env, axis_name)),
             update=jnp.zeros((), jnp.int32),
         )
 
     def step(state: TrainState, key: jax.Array) -> tuple[TrainState, Metrics]:
         key_rollout, key_learn = jax.random.split(key)
         policy_fn = sampling_policy(networks, state.params, state.normalizer)
+        key_rollout = collectives.own(key_rollout, axis_name)
         env_state, transition = method.collect(env, policy_fn, state.env_state, key_rollout)
         batch = prepare(state.params, state.normalizer, transition)
         params, opt_state, metrics = learn(state.params, state.opt_state, batch, key_learn)
         normalizer = state.normalizer
         if normalize_observations:
-            normalizer = normalization.update(normalizer, transition.obs)
-        metrics = metrics | episode_metrics(transition)
+            normalizer = normalization.update(normalizer, transition.obs, axis_name)
+        metrics = metrics | episode_metrics(transition, axis_name)
         return TrainState(params, opt_state, normalizer, env_state, state.update + 1), metrics
 
     return Algorithm(init, step)
 
 
 def batch_of(
-    networks: Networks, method: Method, episode_length: int, reward_scale: float, normalize_advantages: bool
+    networks: Networks,
+    method: Method,
+    episode_length: int,
+    reward_scale: float,
+    normalize_advantages: bool,
+    axis_name: str | None = None,
 ) -> Callable[[PyTree, PyTree, Transition], Batch]:
     """`prepare(params, normalizer, transition) -> Batch`: the advantages of a rollout, and what they are made of.
 
     Args:
-      networks, method, reward_scale, normalize_advantages: as in `actor_critic`.
+      networks, method, reward_scale, normalize_advantages, axis_name: as in `actor_critic`.
       episode_length: the time limit.
     """
 
@@ -203,7 +212,7 @@ def batch_of(
         squared_score = jnp.sum(jnp.square((transition.u - mean) * jnp.exp(-2 * log_std)), axis=-1)
         advantage, target = method.estimate(scaled, weight, value, next_value, squared_score)
         if normalize_advantages:
-            advantage = estimators.normalize_advantages(advantage, weight)
+            advantage = estimators.normalize_advantages(advantage, weight, axis_name=axis_name)
         log_prob = networks.distribution.log_prob(transition.u, mean, log_std)
         log_std = jnp.broadcast_to(log_std, mean.shape)
         return Batch(obs, transition.u, mean, log_std, log_prob, value, advantage, target, weight)

@@ -26,6 +26,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
+from jaxpg import collectives
 from jaxpg.returns import discounted_returns, lambda_returns, n_step_returns, td_errors
 from jaxpg.shapes import floating, same, spread
 
@@ -181,7 +182,9 @@ def td_lambda(
     return Estimate(returns - same(value, returns, "value"), returns)
 
 
-def normalize_advantages(advantage: jax.Array, weight: jax.Array | float = 1.0, epsilon: float = 3e-5) -> jax.Array:
+def normalize_advantages(
+    advantage: jax.Array, weight: jax.Array | float = 1.0, epsilon: float = 3e-5, axis_name: str | None = None
+) -> jax.Array:
     """Advantages with mean 0 and standard deviation 1 over the whole batch.
 
         A'_t = (A_t - mean A) / sqrt(var A + (epsilon max |A|)^2),    with weighted mean and variance
@@ -191,6 +194,7 @@ def normalize_advantages(advantage: jax.Array, weight: jax.Array | float = 1.0, 
       weight: 1 where the step counts, else 0, `[T, ...]` or a scalar. Entries of weight 0 are shifted too, and
         must be masked again by the loss.
       epsilon: keeps a batch of equal entries, whose mean is right to rounding only, near 0.
+      axis_name: a mapped axis, along which there are further parts of the batch.
 
     Raises:
       ValueError: the weight's shape does not fit.
@@ -203,7 +207,8 @@ def normalize_advantages(advantage: jax.Array, weight: jax.Array | float = 1.0, 
     """
     advantage = floating(advantage)
     weight = spread(weight, advantage, "weight")
-    total = jnp.sum(weight)
-    centred = advantage - jnp.sum(weight * advantage) / total
-    variance = jnp.sum(weight * centred**2) / total + (epsilon * jnp.max(jnp.abs(weight * advantage))) ** 2
+    total = collectives.total(jnp.sum(weight), axis_name)
+    centred = advantage - collectives.total(jnp.sum(weight * advantage), axis_name) / total
+    largest = collectives.largest(jnp.max(jnp.abs(weight * advantage)), axis_name)
+    variance = collectives.total(jnp.sum(weight * centred**2), axis_name) / total + (epsilon * largest) ** 2
     return centred / jnp.sqrt(jnp.maximum(variance, jnp.finfo(advantage.dtype).tiny))

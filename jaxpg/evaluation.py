@@ -25,18 +25,15 @@ class Episodes(NamedTuple):
     metrics: Metrics
 
 
-def evaluate(
-    env: Any, policy: Callable[[jax.Array], jax.Array], key: jax.Array, num_episodes: int, episode_length: int
-) -> Episodes:
-    """Plays `num_episodes` episodes, each once, to its end.
+def evaluate(env: Any, policy: Callable[[jax.Array], jax.Array], keys: jax.Array, episode_length: int) -> Episodes:
+    """Plays an episode from each of N starts, once, to its end.
 
         R_i = sum_{t < T_i} r_{i,t},    a_t = policy(s_t)
 
     Args:
       env: brax-shaped environment.
       policy: `policy(obs[N, ...]) -> action[N, m]` in [-1, 1].
-      key: fixes the starts: the same key gives the same ones.
-      num_episodes: N.
+      keys: fix the starts, `[N]`: the same key gives the same one.
       episode_length: the time limit.
 
     Returns:
@@ -53,7 +50,7 @@ def evaluate(
         )
         return (state, alive * (1 - state.done), episodes), None
 
-    state = jax.vmap(env.reset)(jax.random.split(key, num_episodes))
+    state = jax.vmap(env.reset)(keys)
     zeros = jnp.zeros_like(state.reward)
     episodes = Episodes(zeros, zeros.astype(jnp.int32), state.metrics)
     (_, _, episodes), _ = jax.lax.scan(step, (state, zeros + 1, episodes), length=episode_length)

@@ -12,6 +12,7 @@ import jax
 import jax.numpy as jnp
 import optax
 
+from jaxpg import collectives
 from jaxpg.distributions import gaussian_kl
 from jaxpg.losses import (
     clipped_surrogate_loss,
@@ -110,11 +111,17 @@ def actor_critic_loss(
 Learn = Callable[[PyTree, PyTree, Batch, jax.Array], tuple[PyTree, PyTree, Metrics]]
 
 
-def one_step(loss: Callable, optimizer: optax.GradientTransformation) -> Learn:
-    """One gradient step on the whole batch."""
+def one_step(loss: Callable, optimizer: optax.GradientTransformation, axis_name: str | None = None) -> Learn:
+    """One gradient step on the whole batch.
+
+    Args:
+      loss: `loss(params, batch) -> (L, metrics)`.
+      optimizer: of the parameters.
+      axis_name: a mapped axis, along which there are further parts of the batch.
+    """
 
     def learn(params, opt_state, batch, key=None):
-        gradients, metrics = jax.grad(loss, has_aux=True)(params, batch)
+        gradients, metrics = collectives.mean(jax.grad(loss, has_aux=True)(params, batch), axis_name)
         updates, opt_state = optimizer.update(gradients, opt_state, params)
         metrics = metrics | {"gradient_norm": optax.tree.norm(gradients)}
         return optax.apply_updates(params, updates), opt_state, metrics
@@ -122,9 +129,11 @@ def one_step(loss: Callable, optimizer: optax.GradientTransformation) -> Learn:
     return learn
 
 
-def several_steps(loss: Callable, optimizer: optax.GradientTransformation, reuse: Reuse) -> Learn:
+def several_steps(
+    loss: Callable, optimizer: optax.GradientTransformation, reuse: Reuse, axis_name: str | None = None
+) -> Learn:
     """`reuse.epochs` passes over the batch in `reuse.minibatches` parts; metrics are means over the steps taken."""
-    once = one_step(loss, optimizer)
+    once = one_step(loss, optimizer, axis_name)
 
     def take(carry, part):
         params, opt_state, near = carry

@@ -7,6 +7,8 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
+from jaxpg import collectives
+
 
 class RunningStatistics(NamedTuple):
     """Statistics of the samples seen so far.
@@ -31,7 +33,7 @@ def init(size: int) -> RunningStatistics:
     return RunningStatistics(jnp.zeros(()), jnp.zeros(size), jnp.ones(size))
 
 
-def update(statistics: RunningStatistics, batch: jax.Array) -> RunningStatistics:
+def update(statistics: RunningStatistics, batch: jax.Array, axis_name: str | None = None) -> RunningStatistics:
     """The statistics with a batch added, by the pairwise rule, which does not drift.
 
         w = n_b / (n + n_b),   m' = m + w (m_b - m),   v' = (1 - w) v + w v_b + w (1 - w) (m_b - m)^2
@@ -39,6 +41,7 @@ def update(statistics: RunningStatistics, batch: jax.Array) -> RunningStatistics
     Args:
       statistics: so far.
       batch: samples, `[..., size]`.
+      axis_name: a mapped axis, along which there are further parts of the batch.
 
     Source: Chan, Golub and LeVeque, The American Statistician 37 (1983).
 
@@ -46,10 +49,13 @@ def update(statistics: RunningStatistics, batch: jax.Array) -> RunningStatistics
     [1.0]
     """
     samples = batch.reshape(-1, batch.shape[-1])
-    count = statistics.count + len(samples)
-    weight = len(samples) / count
-    shift = jnp.mean(samples, axis=0) - statistics.mean
-    spread = (1 - weight) * statistics.variance + weight * jnp.var(samples, axis=0)
+    number = collectives.total(len(samples), axis_name)
+    mean = collectives.mean(jnp.mean(samples, axis=0), axis_name)
+    variance = collectives.mean(jnp.mean(jnp.square(samples - mean), axis=0), axis_name)
+    count = statistics.count + number
+    weight = number / count
+    shift = mean - statistics.mean
+    spread = (1 - weight) * statistics.variance + weight * variance
     return RunningStatistics(
         count=count,
         mean=statistics.mean + weight * shift,

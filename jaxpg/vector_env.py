@@ -15,6 +15,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
+from jaxpg import collectives
 from jaxpg.shapes import along
 from jaxpg.types import Metrics, Transition
 
@@ -113,19 +114,24 @@ def stagger(state: VectorState, key: jax.Array, episode_length: int) -> VectorSt
     return state._replace(time=time, whole=(time == 0).astype(state.whole.dtype))
 
 
-def episode_metrics(transition: Transition) -> Metrics:
+def episode_metrics(transition: Transition, axis_name: str | None = None) -> Metrics:
     """What a rollout says of its episodes.
 
     `episodes` that ended and `return_sum`, the sum of their returns; `diverged`, how often the physics did, and
     `diverged_env`, the first environment with it, or -1.
+
+    Args:
+      transition: of a rollout.
+      axis_name: a mapped axis, along which there are further environments.
     """
-    where = jnp.any(transition.diverged > 0, axis=0)
-    return {
-        "return_sum": jnp.sum(transition.episode_return),
-        "episodes": jnp.sum(transition.episode_end),
-        "diverged": jnp.sum(transition.diverged),
-        "diverged_env": jnp.where(jnp.any(where), jnp.argmax(where), -1).astype(jnp.int32),
+    counted = {
+        "return_sum": transition.episode_return,
+        "episodes": transition.episode_end,
+        "diverged": transition.diverged,
     }
+    counts = {name: collectives.total(jnp.sum(x), axis_name) for name, x in counted.items()}
+    where = jnp.any(transition.diverged > 0, axis=0)
+    return counts | {"diverged_env": collectives.first_place(where, axis_name)}
 
 
 def _select(mask: jax.Array, if_true: Any, if_false: Any) -> Any:

@@ -9,6 +9,7 @@ import jax
 import pytest
 
 jax.config.update("jax_debug_key_reuse", True)
+jax.config.update("jax_num_cpu_devices", 2)  # for the tests of shards
 
 ROOT = Path(__file__).parent.parent
 

@@ -237,10 +237,13 @@ def test_finds_the_best_action_from_few_rollouts():
 
 
 def test_evaluation_counts_each_episode_once_to_its_end():
-    episodes = evaluate(Counter(life=3), lambda obs: jnp.zeros((4, 1)), new_key(), num_episodes=4, episode_length=10)
+    def four_keys():
+        return jax.random.split(new_key(), 4)
+
+    episodes = evaluate(Counter(life=3), lambda obs: jnp.zeros((4, 1)), four_keys(), 10)
     np.testing.assert_array_equal(episodes.episode_return, 3)
     np.testing.assert_array_equal(episodes.length, 3)
-    longer = evaluate(Counter(life=30), lambda obs: jnp.zeros((4, 1)), new_key(), num_episodes=4, episode_length=10)
+    longer = evaluate(Counter(life=30), lambda obs: jnp.zeros((4, 1)), four_keys(), 10)
     np.testing.assert_array_equal(longer.episode_return, 10)
 
 

@@ -116,6 +116,14 @@ MISTAKES = {
         ["algo=ppo", "num_envs=64", "algo.minibatches=5"],
         "algo.minibatches=5 does not divide num_envs=64: the nearest that does is 4",
     ),
+    "environments of a shard that do not divide": (
+        ["algo=ppo", "num_envs=64", "algo.num_shards=4", "algo.minibatches=10"],
+        "algo.minibatches=10 does not divide num_envs=64 / algo.num_shards=4: the nearest that does is 8",
+    ),
+    "shards that do not divide": (
+        ["algo=td", "num_envs=64", "algo.num_shards=5"],
+        "algo.num_shards=5 does not divide num_envs=64: the nearest that does is 4",
+    ),
     "no clip": (["algo=ppo", "algo.clip=0"], "algo.clip=0: must be above 0"),
     "schedule without an optimizer": (
         ["algo=online", "network.sigma_is=scheduled"],
@@ -261,6 +269,11 @@ DAMAGES = {
     "other environment in config.yaml": (edit_config("id: pendulum", "id: arm"), "unknown option"),
     "config.yaml that is no YAML": (edit_config("env:", "env: ["), "not a configuration of a run"),
     "versions.json torn": (other_versions, "cannot be read"),
+    "versions.json of another kind": (lambda folder: (folder / "versions.json").write_text("[]"), "not what a run"),
+    "threads in words": (
+        lambda folder: (folder / "versions.json").write_text('{"threads": "two"}'),
+        "not what a run writes there, an object whose threads is at least 1",
+    ),
 }
 
 

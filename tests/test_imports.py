@@ -22,9 +22,10 @@ LEVELS = [
         "features",
         "normalization",
         "compatibility",
+        "collectives",
     },
     {"networks", "vector_env"},
-    {"rollout", "learning", "actor_critic", "online", "training", "soundness", "evaluation"},
+    {"rollout", "learning", "actor_critic", "online", "training", "soundness", "shards", "evaluation"},
     {"run", "train", "evaluate", "inspect"},
 ]
 FOREIGN = {0: {"jax"}, 1: {"jax", "flax"}, 2: {"jax", "optax"}}

@@ -37,11 +37,22 @@ def test_features_tuned_for_one_network_say_nothing_of_another():
     assert compose(["env=pendulum"]).network.features == "polynomial"
 
 
-def test_tuned_minibatches_divide_the_environments_asked_for():
-    """Where nobody has asked for minibatches; those that were are refused if they do not (tests/test_bad_input.py)."""
-    tuned = envs.find("pendulum").training["ppo"]["algo.minibatches"]
-    assert [compose([f"num_envs={n}"]).algo.minibatches for n in (1, 2, 12, 4 * tuned)] == [1, 2, 6, tuned]
-    assert compose(["num_envs=8", "algo.minibatches=8"]).algo.minibatches == 8
+def test_tuned_shards_and_minibatches_divide_the_environments_asked_for():
+    """Where nobody has asked for them; those that were are refused if they do not (tests/test_bad_input.py)."""
+    tuned = envs.find("pendulum").training["ppo"]
+    shards, minibatches = tuned["algo.num_shards"], tuned["algo.minibatches"]
+    assert (shards, minibatches) == (2, 8)
+
+    def found(*arguments):
+        algo = compose(arguments).algo
+        return algo.num_shards, algo.minibatches
+
+    assert found() == (2, 8)
+    assert [found(f"num_envs={n}") for n in (1, 2, 12, 64)] == [(1, 1), (2, 1), (2, 6), (2, 8)]
+    assert found("num_envs=8", "algo.minibatches=8") == (1, 8)
+    assert found("num_envs=8", "algo.minibatches=4") == (2, 4)
+    assert found("algo.num_shards=128") == (128, 4)
+    assert found("num_envs=8", "algo.num_shards=4") == (4, 2)
 
 
 @pytest.mark.parametrize("algo", [("algo=td",), ("algo=ppo", "algo.epochs=3", "algo.minibatches=2")])

@@ -102,6 +102,8 @@ class Checkpoints:
         arguments = ocp.args.Composite(state=ocp.args.StandardSave(content), meta=ocp.args.JsonSave(record))
         with self._writing(step):
             saved = self._manager.save(step, args=arguments)
+            if saved:
+                _to_disk(self.folder / str(step))
             if self._failed:  # what still wrote for the failed save may have written into this one
                 self.read(step)
         if not saved:
@@ -224,6 +226,16 @@ class Checkpoints:
             return self._manager.restore(step, args=ocp.args.Composite(**items))
         except Exception as error:  # a damaged file surfaces as any of a dozen types
             raise CheckpointError(f"{self.folder / str(step)}: cannot be read ({_reason(error)})") from error
+
+
+def _to_disk(folder: Path) -> None:
+    """A checkpoint is where a power failure leaves it: orbax leaves all but the arrays to the operating system."""
+    for path in (*folder.rglob("*"), folder, folder.parent):
+        descriptor = os.open(path, os.O_RDONLY)
+        try:
+            os.fsync(descriptor)
+        finally:
+            os.close(descriptor)
 
 
 def _reason(error: BaseException) -> str:

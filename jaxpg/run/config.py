@@ -105,11 +105,16 @@ def _conflicts_of_the_algorithm(config: Config) -> Iterator[str]:
             yield "algo.baseline=leave_one_out needs other episodes: num_envs must be at least 2"
         if algo.discounted and algo.returns == "whole":
             yield "algo.discounted=true: whole returns have the factors gamma^t in them; leave it out"
-    if config.choices["algo"] == "ppo" and run.num_envs % algo.minibatches:
-        yield (
-            f"algo.minibatches={algo.minibatches} does not divide num_envs={run.num_envs}: "
-            f"the nearest that does is {_nearest_divisor(run.num_envs, algo.minibatches)}"
-        )
+    shards = getattr(algo, "num_shards", 1)
+    if run.num_envs % shards:
+        yield _does_not_divide("algo.num_shards", shards, f"num_envs={run.num_envs}", run.num_envs)
+    elif config.choices["algo"] == "ppo" and run.num_envs // shards % algo.minibatches:
+        whole = f"num_envs={run.num_envs}" + (f" / algo.num_shards={shards}" if shards > 1 else "")
+        yield _does_not_divide("algo.minibatches", algo.minibatches, whole, run.num_envs // shards)
+
+
+def _does_not_divide(name: str, value: int, whole: str, number: int) -> str:
+    return f"{name}={value} does not divide {whole}: the nearest that does is {_nearest_divisor(number, value)}"
 
 
 def _conflicts_of_the_network(config: Config) -> Iterator[str]:
@@ -160,7 +165,7 @@ def compose(arguments: Sequence[str]) -> Config:
     """
     given = parse(arguments)
     _check_choices(_members(given))
-    tuned = _fitting(_tuned(_members(given)), given.get("num_envs"))
+    tuned = _fitting(_tuned(_members(given)), given)
     choices = DEFAULT_CHOICES | _members(tuned) | _members(given)
     _check_choices(choices)
     swept, plain = _divide(given)
@@ -201,11 +206,20 @@ def _tunable(tuned: Mapping[str, Any], choices: Mapping[str, str]) -> set[str]:
     return known - {f"network.{name}" for name in own - {field.name for field in dataclasses.fields(Gaussian)}}
 
 
-def _fitting(tuned: Mapping[str, Any], num_envs: Any) -> Mapping[str, Any]:
-    """The tuned values with a number of minibatches that divides the environments asked for."""
-    if "algo.minibatches" not in tuned or not isinstance(num_envs, int) or not 1 <= num_envs <= LARGEST:
+def _fitting(tuned: Mapping[str, Any], given: Mapping[str, Any]) -> Mapping[str, Any]:
+    """The tuned values with numbers of shards, and of minibatches of each, that divide the environments asked for."""
+    left, fitting = given.get("num_envs", tuned.get("num_envs")), {}
+    if not isinstance(left, int) or not 1 <= left <= LARGEST:
         return tuned
-    return {**tuned, "algo.minibatches": _nearest_divisor(num_envs, tuned["algo.minibatches"])}
+    divisors = ("algo.num_shards", "algo.minibatches")
+    for name in divisors:
+        if isinstance(given.get(name), int) and given[name] in range(1, left + 1):
+            left //= given[name]  # where it does not divide them, that is a conflict of what was asked for
+    for name in divisors:
+        if name in tuned and name not in given:
+            fitting[name] = _nearest_divisor(left, tuned[name])
+            left //= fitting[name]
+    return {**tuned, **fitting}
 
 
 def parse(arguments: Sequence[str]) -> dict[str, Any]:

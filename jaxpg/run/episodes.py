@@ -21,7 +21,7 @@ def play_own(stored: StoredPolicy, num_episodes: int, seed: int) -> Results:
     @jax.jit
     def play(policy, key):
         act = functools.partial(stored.act, policy)
-        return evaluate(stored.env, act, key, num_episodes, stored.config.env.episode_length)
+        return evaluate(stored.env, act, jax.random.split(key, num_episodes), stored.config.env.episode_length)
 
     episodes = play(stored.policy, jax.random.key(seed))
     metrics = {name: np.asarray(values) for name, values in episodes.metrics.items()}

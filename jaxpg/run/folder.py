@@ -23,6 +23,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
+import jax
 import numpy as np
 
 from jaxpg.run import lock
@@ -160,7 +161,8 @@ def versions() -> dict[str, Any]:
     """What the bits of a run depend on besides its options."""
     packages = {name: importlib.metadata.version(name) for name in RECORDED_PACKAGES}
     machine = {"python": platform.python_version(), "machine": platform.machine(), "threads": num_threads()}
-    return packages | machine | {"xla_flags": os.environ.get("XLA_FLAGS", "")}
+    devices = f"{jax.device_count()} {jax.default_backend()}"
+    return packages | machine | {"devices": devices, "xla_flags": os.environ.get("XLA_FLAGS", "")}
 
 
 def write_versions(folder: RunFolder) -> None:
@@ -169,11 +171,15 @@ def write_versions(folder: RunFolder) -> None:
 
 
 def read_versions(folder: RunFolder) -> dict[str, Any]:
-    """What computed the run; raises UserError if the file cannot be read."""
+    """What computed the run; raises UserError if the file cannot be read, or is not as `write_versions` left it."""
     try:
-        return json.loads(folder.versions.read_text(encoding="utf-8"))
+        recorded = json.loads(folder.versions.read_text(encoding="utf-8"))
     except (OSError, ValueError) as error:
         raise UserError(f"{folder.versions}: cannot be read ({error})") from error
+    threads = recorded.get("threads", 1) if isinstance(recorded, dict) else None
+    if type(threads) is not int or threads < 1:
+        raise UserError(f"{folder.versions}: not what a run writes there, an object whose threads is at least 1")
+    return recorded
 
 
 def num_threads() -> int:

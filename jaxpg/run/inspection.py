@@ -11,6 +11,7 @@ from jaxpg.run.config import Config
 from jaxpg.run.folder import RunFolder, jsonable
 from jaxpg.run.program import Schedule, plan
 from jaxpg.run.results import best_returns, table
+from jaxpg.run.runtime import prepare
 from jaxpg.run.session import is_solved
 from jaxpg.run.terminal import shown
 
@@ -51,6 +52,7 @@ def inspect(path: str) -> Inspection:
     """
     run_folder = folder.find(path)
     config, lines = configuration.load(run_folder.config), folder.read_metrics(run_folder)
+    prepare(config)  # as for a training, whose versions are compared
     stored = Checkpoints(run_folder.checkpoints, read_only=True)
     checkpoints = {number: _problem(stored, number) for number in stored.numbers()}
     sound = [number for number, problem in checkpoints.items() if problem is None]

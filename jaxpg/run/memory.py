@@ -18,8 +18,7 @@ import jax
 from jaxpg.features import num_features
 from jaxpg.run.config import Config, flatten
 from jaxpg.run.errors import UserError
-from jaxpg.run.folder import num_threads
-from jaxpg.run.program import plan
+from jaxpg.run.program import groups_at_once, plan
 from jaxpg.types import PyTree
 
 NUMBER = 4  # bytes
@@ -81,7 +80,7 @@ def needed(config: Config, env: Any) -> int:
     rollout = 0 if online else NUMBER * step * run.num_steps * run.num_envs
     episodes = of_env * run.eval_episodes
     chunk = NUMBER * METRICS * plan(config).chunk
-    at_once = min(config.num_agents, run.vmap_seeds * num_threads())
+    at_once = min(config.num_agents, run.vmap_seeds * groups_at_once(config))
     return (agent + chunk) * (config.num_agents + at_once) + max(rollout, episodes) * at_once
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+import math
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any, NamedTuple
@@ -12,9 +13,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import optax
+from jax.stages import Compiled
 
 import envs
 from envs.options import OptionError
+from jaxpg import shards
 from jaxpg.actor_critic import Method, actor_critic, deterministic_policy, reinforce, td
 from jaxpg.distributions import GAUSSIAN, SQUASHED_GAUSSIAN
 from jaxpg.evaluation import Episodes, evaluate
@@ -130,12 +133,12 @@ def make_networks(config: Config, env: Any) -> Networks:
 
 def make_algorithm(config: Config, env: Any) -> Algorithm:
     """One agent's algorithm, as pure functions."""
-    algo, run = config.algo, config.run
-    batch = vectorize(env, run.num_envs, training_length(config))
+    algo, run, number = config.algo, config.run, num_shards(config)
+    batch = vectorize(env, run.num_envs // number, training_length(config))
     networks = make_networks(config, env)
     if config.choices["algo"] == "online":
         return online_actor_critic(batch, networks, num_steps=run.num_steps, **dataclasses.asdict(algo))
-    return actor_critic(
+    algorithm = actor_critic(
         batch,
         networks,
         make_optimizer(config),
@@ -145,7 +148,19 @@ def make_algorithm(config: Config, env: Any) -> Algorithm:
         entropy_coef=algo.entropy_coef,
         normalize_observations=algo.normalize_observations,
         normalize_advantages=algo.normalize_advantages,
+        axis_name=shards.AXIS if number > 1 else None,
     )
+    return shards.sharded(algorithm, number, jax.devices()) if number > 1 else algorithm
+
+
+def num_shards(config: Config) -> int:
+    """Parts of each agent's environments."""
+    return getattr(config.algo, "num_shards", 1)
+
+
+def groups_at_once(config: Config) -> int:
+    """Groups of agents that compute at the same time: with shards, which meet, one could wait for another for ever."""
+    return num_threads() if num_shards(config) == 1 else 1
 
 
 def training_length(config: Config) -> int:
@@ -242,9 +257,14 @@ def compile_program(
     def advance(agent, train):
         return train_scan(algorithm(agent), jax.random.key(agent.seed), chunk, train)
 
-    def play(policy):
+    def play_from(policy, starts):
         act = deterministic_policy(networks, policy.params, policy.normalizer)
-        return evaluate(env, act, jax.random.key(SELECTION_SEED), run.eval_episodes, config.env.episode_length)
+        return evaluate(env, act, starts, config.env.episode_length)
+
+    def play(policy):
+        starts = jax.random.split(jax.random.key(SELECTION_SEED), run.eval_episodes)
+        parts = math.gcd(run.eval_episodes, num_shards(config))
+        return shards.in_parts(play_from, parts, jax.devices())(policy, starts)
 
     init, advance, play = (over_agents(fn, run.vmap_seeds) for fn in (init, advance, play))
     of_group = jax.tree.map(lambda x: x[: run.vmap_seeds], agents)
@@ -257,7 +277,10 @@ def compile_program(
         init = None if resumed else pool.submit(init.lower().compile, RUN_ONCE)
         play = pool.submit(jax.jit(play).lower(current_policy(shape.train)).compile, OPTIMIZED)
         meanwhile()
-    init, advance, play = (in_groups(fn.result(), run.vmap_seeds) if fn else None for fn in (init, advance, play))
+    at_once = groups_at_once(config)
+    init, advance, play = (
+        in_groups(fn.result(), run.vmap_seeds, at_once) if fn else None for fn in (init, advance, play)
+    )
     return Program(
         functools.partial(init, agents) if init else None,
         functools.partial(advance, agents),
@@ -290,12 +313,20 @@ def over_agents(fn: Callable, number: int) -> Callable:
     return one
 
 
-def in_groups(fn: Callable, size: int) -> Callable:
-    """`fn`, compiled for `size` agents, for any multiple of as many: `[S, ...]` to `[S, ...]`.
+def in_groups(compiled: Compiled, size: int, at_once: int) -> Callable:
+    """What was compiled for `size` agents, for any multiple of as many: `[S, ...]` to `[S, ...]`.
 
-    The groups run in as many threads as XLA has, which computes without Python's lock; with a single one XLA itself
-    takes them one after the other. One group is handed through as it is; several come back as numpy arrays.
+    One group is handed through as it is; several come back as numpy arrays.
+
+    Args:
+      compiled: takes and gives trees whose leaves begin with the agents' axis.
+      size: agents of a group.
+      at_once: groups that run at the same time, each in a thread, as XLA computes without Python's lock.
     """
+    where, _ = compiled.input_shardings
+
+    def fn(*arguments):
+        return compiled(*jax.device_put(arguments, where))  # shards may be wanted on other devices than they came from
 
     def run(*arguments):
         number = len(jax.tree.leaves(arguments)[0])
@@ -303,7 +334,7 @@ def in_groups(fn: Callable, size: int) -> Callable:
             return fn(*arguments)
         arguments = jax.tree.map(_on_host, arguments)
         groups = [jax.tree.map(lambda x, i=i: x[i : i + size], arguments) for i in range(0, number, size)]
-        with ThreadPoolExecutor(num_threads()) as pool:
+        with ThreadPoolExecutor(at_once) as pool:
             results = list(pool.map(lambda group: jax.tree.map(_on_host, fn(*group)), groups))
         return jax.tree.map(lambda *parts: (jnp if is_key(parts[0]) else np).concatenate(parts), *results)
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import signal
 import subprocess
@@ -31,6 +32,8 @@ def prepare(config: Config, threads: int | None = None) -> None:
     if threads is None and config.choices["env"] == "brax" and may_deadlock(jaxlib.__version__):
         threads = 1
     os.environ["PJRT_NPROC"] = str(threads or num_threads())
+    with contextlib.suppress(RuntimeError):  # where the process has computed something already, with what it has
+        jax.config.update("jax_num_cpu_devices", getattr(config.algo, "num_shards", 1))
     try:
         jax.devices()
     except (RuntimeError, AssertionError) as error:  # the latter, without words, where jax has no plugin for it

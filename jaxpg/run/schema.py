@@ -63,6 +63,9 @@ class TD(Learning):
     episode_length: int | None = option(
         None, "steps after which a training episode is cut and begun anew [default: the environment's]", at_least=1
     )
+    num_shards: int = option(
+        1, "parts of the environments, each on a core or device of its own; divides num_envs", at_least=1, at_most=1024
+    )
 
 
 @dataclass(frozen=True)

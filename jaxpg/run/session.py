@@ -112,14 +112,14 @@ def begin_or_resume(config: Config) -> int:
 def _go_on(config: Config, run_folder: RunFolder) -> int:
     from jaxpg.run.checkpoint import Checkpoints
 
+    recorded = folder.read_versions(run_folder)
+    prepare(config, recorded.get("threads"))  # before orbax restores anything, which starts the backend as well
     checkpoints = Checkpoints(run_folder.checkpoints)
     if checkpoints.latest() is None:
         raise UserError(
             f"{run_folder.path} has no checkpoint yet: begin again in another run_dir, or here with resume=auto"
         )
     update, problems = checkpoints.newest_sound()
-    recorded = folder.read_versions(run_folder)
-    prepare(config, recorded.get("threads"))
     schedule = plan(config, done=update)
     display = Display(schedule.total_steps, steps=update * schedule.steps_per_update)
     for problem in problems:
