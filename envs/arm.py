@@ -19,7 +19,7 @@ import jax
 import jax.numpy as jnp
 from flax import struct
 
-from envs.base import ASSETS, MjxEnv, State, initial_state
+from envs.base import ASSETS, Interface, MjxEnv, State, initial_state
 from envs.options import OptionError, option
 from envs.physics import PHYSICS, load_spec
 
@@ -51,7 +51,7 @@ class ArmConfig:
     success_radius: float = option(0.05, "distance that counts as reached [m]", above=0)
     dt: float = option(0.05, "time between two actions [s]", above=0, at_most=1)
     num_substeps: int = option(5, "physics steps between two actions", at_least=1)
-    physics: str = option("scalar", "MJX's step as scalar equations, or as it is", choices=PHYSICS)
+    physics: str = option("scalar", "MJX's step as scalar equations or as it is, or C MuJoCo's", choices=PHYSICS)
     episode_length: int = option(100, "steps until the time limit", at_least=1)
 
     def __post_init__(self):
@@ -125,6 +125,18 @@ class Arm(MjxEnv):
         self.config = config
         self.lengths = (config.upper_length, config.fore_length)
         super().__init__(_spec(config), config.num_substeps, config.physics, check=False)
+
+    @property
+    def interface(self) -> Interface:
+        config, joints = self.config, ("shoulder", "elbow")
+        kind, unit = ("torque", "N m") if config.control == "torque" else ("velocity", "rad/s")
+        limit = config.torque_limit if config.control == "torque" else config.velocity_limit
+        angles = [f"{function}(q_{joint})" for function in ("cos", "sin") for joint in joints]
+        speeds = [f"q_{joint}' [rad/s]" for joint in joints]
+        places = [f"{name}_{axis} [m]" for name in ("goal", "error") for axis in "xy"]
+        return Interface(
+            (*angles, *speeds, *places), tuple(f"{joint} {kind} [{unit}]" for joint in joints), (limit, limit)
+        )
 
     def reset(self, rng: jax.Array) -> State:
         """q ~ U(-pi, pi)^2 at rest, goal uniform over the ring's area."""

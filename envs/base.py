@@ -12,7 +12,7 @@ is not needed for them. Time limits are not the environment's business: `done` i
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -42,6 +42,21 @@ class State:
     done: jax.Array
     metrics: dict[str, jax.Array] = struct.field(default_factory=dict)
     info: dict[str, Any] = struct.field(default_factory=dict)
+
+
+class Interface(NamedTuple):
+    """What an environment's numbers are to a robot; optional, as the attribute `interface`.
+
+    Attributes:
+      observations: name and unit of each number that is observed.
+      commands: name and unit of each number that an action commands.
+      limits: the command at action 1, for each; what is commanded is limit * clip(action, -1, 1). None: the action is
+        the command, and has no limits.
+    """
+
+    observations: tuple[str, ...]
+    commands: tuple[str, ...]
+    limits: tuple[float, ...] | None
 
 
 class MjxEnv:

@@ -17,7 +17,7 @@ import jax
 import jax.numpy as jnp
 from flax import struct
 
-from envs.base import ASSETS, MjxEnv, State, initial_state
+from envs.base import ASSETS, Interface, MjxEnv, State, initial_state
 from envs.options import option
 from envs.physics import PHYSICS, load_spec
 
@@ -32,7 +32,7 @@ class PendulumConfig:
     torque_limit: float = option(2.0, "largest torque, reached at |action| = 1 [N m]", above=0)
     speed_limit: float = option(8.0, "angular speed is clipped to this [rad/s]", above=0)
     dt: float = option(0.05, "time between two actions, one physics step [s]", above=0, at_most=1)
-    physics: str = option("scalar", "MJX's step as scalar equations, or as it is", choices=PHYSICS)
+    physics: str = option("scalar", "MJX's step as scalar equations or as it is, or C MuJoCo's", choices=PHYSICS)
     episode_length: int = option(200, "steps until the time limit", at_least=1)
 
 
@@ -112,6 +112,10 @@ class Pendulum(MjxEnv):
     def __init__(self, config: PendulumConfig = PendulumConfig()):
         self.config = config
         super().__init__(_spec(config), physics=config.physics, check=False)
+
+    @property
+    def interface(self) -> Interface:
+        return Interface(("cos(theta)", "sin(theta)", "theta' [rad/s]"), ("torque [N m]",), (self.config.torque_limit,))
 
     def reset(self, rng: jax.Array) -> State:
         """theta ~ U(-pi, pi), theta' ~ U(-1, 1)."""

@@ -22,7 +22,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from envs.base import State, initial_state
+from envs.base import Interface, State, initial_state
 from envs.options import option
 
 
@@ -150,6 +150,14 @@ class LinearQuadratic:
         self.observation_size, self.action_size = problem.B.shape
         self._spread = _root(problem.initial_covariance)
         self._noise = _root(problem.W)
+
+    @property
+    def interface(self) -> Interface:
+        states, actions = (
+            tuple(f"{name}_{i}" for i in range(n))
+            for name, n in (("s", self.observation_size), ("a", self.action_size))
+        )
+        return Interface(states, actions, limits=None)
 
     def reset(self, rng: jax.Array) -> State:
         """s_0 ~ N(m_0, S_0)."""

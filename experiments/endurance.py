@@ -26,6 +26,7 @@ from jaxpg.run.folder import RunFolder, read_metrics
 
 WARM_UP = 1 / 60  # of the time; compiling and the first evaluation and checkpoint are over by then
 SAMPLES = 360
+TASK = "pendulum"
 
 
 def resident(process: int) -> float:
@@ -37,7 +38,7 @@ def resident(process: int) -> float:
 def train(folder: Path, seconds: float, options: list[str]) -> dict[str, Any]:
     """Memory and steps of a run that is stopped after `seconds` of training."""
     run = RunFolder(folder)
-    arguments = ["env=pendulum", "total_steps=1000000000", *options, f"run_dir={folder}"]
+    arguments = [f"env={TASK}", "total_steps=1000000000", *options, f"run_dir={folder}"]
     command = [sys.executable, "-m", "jaxpg.train", *arguments]
     when, memory = [], []
     with subprocess.Popen(command, stdout=subprocess.DEVNULL) as process:
@@ -69,7 +70,7 @@ def draw(result: dict[str, Any]) -> Figure:
     axes = figure.subplots()
     axes.plot(np.array(result["seconds"]) / 60, result["resident, MB"])
     axes.set(xlabel="minutes of training", ylabel="resident memory, MB", ylim=(0, None))
-    axes.set_title(f"{result['steps']:,} environment steps of pendulum")
+    axes.set_title(f"{result['steps']:,} environment steps of {TASK}")
     axes.grid(alpha=0.3)
     return figure
 

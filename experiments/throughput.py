@@ -6,7 +6,8 @@ For several numbers of environments and network widths, rollouts of 8 steps, in 
 several rounds each:
 
 - steps/s of the training as it is; with the physics taken out (the state stands still); with the networks taken out
-  (actions are noise, nothing is learned: rollouts only); with all but the networks' matrix products taken out;
+  (actions are noise, nothing is learned: rollouts only); with all but the networks' matrix products taken out; as it
+  is, but with the environments in two shards, each on a core of its own;
 - its share of the peak: multiplications and additions of the networks' matrix products, over the rate of one product of
   two 1,024 x 1,024 matrices in the same process. A sample passes the actor twice (to act, to learn) and the critic
   once, a rollout's ends twice more; each of the two that learn costs twice a pass more, backwards; beside it the share
@@ -14,7 +15,8 @@ several rounds each:
 - memory that the program needs beside its arguments.
 
 Then the programs of `python -m jaxpg.train` for 8 and 64 agents at once: their time over that of one agent times their
-number, with the agents in programs of their own, side by side on the cores, and with several in one program (vmap).
+number, with the agents in programs of their own, side by side on the cores, and with several in one program (vmap);
+and over that of one agent in two shards, which has both cores to itself.
 
 Writes results/throughput.json and prints it as tables.
 """
@@ -32,6 +34,7 @@ from commands import write_json
 from jaxpg.rollout import rollout
 from jaxpg.run.config import Config, compose
 from jaxpg.run.program import compile_program, make_algorithm, make_env, plan
+from jaxpg.run.runtime import prepare
 from jaxpg.training import initial_state, train_scan
 from jaxpg.vector_env import vectorize
 
@@ -42,13 +45,15 @@ ALGORITHMS = ("ppo", "td")
 SEEDS = (8, 64)
 IN_ONE_PROGRAM = (1, 4, 8)
 NUM_STEPS = 8
+SHARDS = 2
 SAMPLES = 80_000  # of one measurement, of each agent
 ROUNDS = 7
 
 
-def configured(num_envs: int, width: int) -> Config:
+def configured(num_envs: int, width: int, shards: int = 1) -> Config:
     sizes = f"num_envs={num_envs}", f"num_steps={NUM_STEPS}", f"network.widths=[{width},{width}]"
-    return compose([f"env={TASK}", "algo=td", "network=mlp", "network.activation=tanh", *sizes])
+    options = "algo=td", f"algo.num_shards={shards}", "network=mlp", "network.activation=tanh"
+    return compose([f"env={TASK}", *options, *sizes])
 
 
 class Standing:
@@ -132,7 +137,9 @@ def seconds(programs: dict[str, tuple[Callable, Any]]) -> dict[str, float]:
 
 
 def compiled(run: Callable, state: Any) -> tuple[Callable, Any]:
-    return jax.jit(run).lower(state).compile(), state
+    program = jax.jit(run).lower(state).compile()
+    (where,), _ = program.input_shardings
+    return program, jax.device_put(state, where)
 
 
 def operations(observation_size: int, width: int) -> int:
@@ -151,6 +158,7 @@ def sizes() -> list[dict[str, Any]]:
             samples = num_updates(config) * num_envs * NUM_STEPS
             programs = {
                 "training": compiled(*training(config, env)),
+                "in shards": compiled(*training(configured(num_envs, width, SHARDS), env)),
                 "no physics": compiled(*training(config, Standing(env))),
                 "no networks": compiled(*rollouts(config, env)),
                 "products alone": compiled(*products(config, env.observation_size)),
@@ -162,10 +170,11 @@ def sizes() -> list[dict[str, Any]]:
                 {"environments": num_envs, "width": width}
                 | {
                     f"{name}, steps/s": round(samples / took[name])
-                    for name in ("training", "no physics", "no networks")
+                    for name in ("training", "in shards", "no physics", "no networks")
                 }
                 | {
                     "share of peak": round(work / took["training"] / peak, 3),
+                    "in shards, share": round(work / took["in shards"] / peak, 3),
                     "products alone": round(work / took["products alone"] / peak, 3),
                     "peak, GFLOP/s": round(peak / 1e9, 1),
                     "memory, MB": round(memory / 1e6, 1),
@@ -178,19 +187,23 @@ def sizes() -> list[dict[str, Any]]:
 def agents() -> list[dict[str, Any]]:
     rows = []
     for algo in ALGORITHMS:
-        alone = seconds({"alone": agents_at_once(algo, 1, 1)})["alone"]
+        alone = seconds({"alone": agents_at_once(algo, 1, 1), "in shards": agents_at_once(algo, 1, 1, SHARDS)})
         for number in SEEDS:
             programs = {str(size): agents_at_once(algo, number, size) for size in IN_ONE_PROGRAM}
             took = seconds(programs)
-            shares = {f"{size} in a program": round(took[str(size)] / number / alone, 3) for size in IN_ONE_PROGRAM}
+            shares = {
+                f"{size} in a program": round(took[str(size)] / number / alone["alone"], 3) for size in IN_ONE_PROGRAM
+            }
+            shares["over one in shards"] = round(took["1"] / number / alone["in shards"], 3)
             rows.append({"algorithm": algo, "agents": number, **shares})
             print(rows[-1], flush=True)
     return rows
 
 
-def agents_at_once(algo: str, number: int, size: int) -> tuple[Callable, Any]:
+def agents_at_once(algo: str, number: int, size: int, shards: int = 1) -> tuple[Callable, Any]:
     """The updates between two lines of metrics of this many agents, `size` of them in one program."""
-    config = compose([f"env={TASK}", f"algo={algo}", f"num_seeds={number}", f"vmap_seeds={size}"])
+    agents = f"num_seeds={number}", f"vmap_seeds={size}"
+    config = compose([f"env={TASK}", f"algo={algo}", f"algo.num_shards={shards}", *agents])
     program = compile_program(config, make_env(config), plan(config).chunk)
     return program.advance, program.init().train
 
@@ -203,6 +216,7 @@ def table(rows: list[dict[str, Any]]) -> None:
 
 
 def main() -> None:
+    prepare(configured(NUM_ENVS[0], WIDTHS[0], SHARDS))
     result = {"sizes": sizes(), "agents": agents()}
     write_json("throughput.json", result)
     for rows in result.values():

@@ -63,6 +63,11 @@ def update(statistics: RunningStatistics, batch: jax.Array, axis_name: str | Non
     )
 
 
+def inverse_deviation(statistics: RunningStatistics, epsilon: float = 1e-6) -> jax.Array:
+    """1 / sqrt(variance + epsilon), `[size]`: the factor of `normalize`."""
+    return jax.lax.rsqrt(statistics.variance + epsilon)
+
+
 def normalize(statistics: RunningStatistics, x: jax.Array, epsilon: float = 1e-6) -> jax.Array:
     """(x - mean) / sqrt(variance + epsilon), `[..., size]`; a constant component becomes 0.
 
@@ -70,4 +75,4 @@ def normalize(statistics: RunningStatistics, x: jax.Array, epsilon: float = 1e-6
     >>> normalize(statistics, jnp.array([5.0])).round(3).tolist()
     [2.0]
     """
-    return (x - statistics.mean) * jax.lax.rsqrt(statistics.variance + epsilon)
+    return (x - statistics.mean) * inverse_deviation(statistics, epsilon)

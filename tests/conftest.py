@@ -1,6 +1,7 @@
 """Shared by all tests: strict JAX settings, a compilation cache for the session, and how commands are run."""
 
 import os
+import signal
 import subprocess
 import sys
 from pathlib import Path
@@ -11,13 +12,17 @@ import pytest
 jax.config.update("jax_debug_key_reuse", True)
 jax.config.update("jax_num_cpu_devices", 2)  # for the tests of shards
 
+if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:  # as in the background of a shell: commands would be deaf to it
+    signal.signal(signal.SIGINT, signal.default_int_handler)
+
 ROOT = Path(__file__).parent.parent
 
 
 @pytest.fixture(scope="session")
 def command_environment(tmp_path_factory):
     """The environment of commands under test: they share a cache of their own, so that a program compiles once."""
-    cache = str(tmp_path_factory.mktemp("cache"))
+    session = tmp_path_factory.getbasetemp()
+    cache = str((session.parent if "PYTEST_XDIST_WORKER" in os.environ else session) / "cache")  # of all workers
     environment = os.environ | {"XDG_CACHE_HOME": cache, "PYTHONIOENCODING": "utf-8", "COLUMNS": "120"}
     environment.pop("JAX_COMPILATION_CACHE_DIR", None)  # with it jax's own cache would be used instead
     return environment

@@ -85,6 +85,46 @@ def test_throughput(experiments, monkeypatch):
     assert all(0 < row[f"{size} in a program"] < 10 for size in (1, 2))
 
 
+@pytest.mark.study
+def test_robustness(experiments, monkeypatch):
+    import robustness
+
+    monkeypatch.setattr(robustness, "TASKS", {"quadratic": ("env=quadratic", "log_interval=3000")})
+    monkeypatch.setattr(robustness, "STOPS", 2)
+    monkeypatch.setattr(robustness, "STEPS", 100_000)
+    robustness.main()
+    (row,) = json.loads((experiments / "robustness.json").read_text())
+    assert 0 < row["median, s"] <= row["worst, s"] < 60
+    assert 0 < row["share"] < 1
+
+
+@pytest.mark.study
+def test_endurance(experiments, monkeypatch):
+    import endurance
+
+    monkeypatch.setattr(endurance, "TASK", "quadratic")
+    monkeypatch.setattr(sys, "argv", ["endurance.py", "--seconds", "2"])
+    endurance.main()
+    result = json.loads((experiments / "endurance.json").read_text())
+    assert min(result["resident, MB"]) > 100
+    assert result["steps"] > 0
+    assert (experiments / "endurance.png").read_bytes().startswith(b"\x89PNG")
+
+
+@pytest.mark.study
+def test_deploy(experiments, monkeypatch):
+    import deploy
+
+    for name, value in {"TASK": "quadratic", "CALLS": 10, "LOOPS": 1000}.items():
+        monkeypatch.setattr(deploy, name, value)
+    deploy.main()
+    result = json.loads((experiments / "deploy.json").read_text())
+    assert max(result["differences"].values()) < 1e-5
+    assert all(value > 0 for value in result["ns"].values())
+    assert result["c"]["variables, bytes"] == 0 < result["c"]["code and constants, bytes"]
+    np.testing.assert_allclose(list(result["returns"].values()), result["returns"]["jax, mjx"], atol=1e-3)
+
+
 def test_sigma_choices(experiments, monkeypatch):
     import sigma_choices
 

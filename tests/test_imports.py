@@ -26,7 +26,7 @@ LEVELS = [
     },
     {"networks", "vector_env"},
     {"rollout", "learning", "actor_critic", "online", "training", "soundness", "shards", "evaluation"},
-    {"run", "train", "evaluate", "inspect"},
+    {"run", "deploy", "train", "evaluate", "inspect", "export"},
 ]
 FOREIGN = {0: {"jax"}, 1: {"jax", "flax"}, 2: {"jax", "optax"}}
 

@@ -246,13 +246,12 @@ def test_a_thousand_calls_end(name, num_envs):
     assert np.isfinite(qvel).all()
 
 
-def test_environments_have_both_physics():
-    """`env.physics=mjx` takes the same step."""
-    state = envs.make("arm").reset(jax.random.key(0))
-    ours, theirs = (
-        jax.jit(envs.make("arm", physics=physics).step)(state, jnp.asarray([0.4, -0.7]))
-        for physics in ("scalar", "mjx")
-    )
+@pytest.mark.parametrize("physics", ["mjx", "mujoco"])
+def test_environments_have_other_physics(physics):
+    """`env.physics=mjx` and `mujoco` take the same steps, of several environments at once."""
+    state = jax.vmap(envs.make("arm").reset)(jax.random.split(jax.random.key(0), 3))
+    action = jnp.asarray([[0.4, -0.7], [1.0, 0.0], [-0.2, 0.5]])
+    ours, theirs = (jax.jit(jax.vmap(envs.make("arm", physics=x).step))(state, action) for x in ("scalar", physics))
     agree(jax.tree.leaves(ours), jax.tree.leaves(theirs), 1e-5)
 
 
@@ -269,8 +268,10 @@ def test_bad_arguments_are_named():
     activated = models.chain(models.pole(), '<intvelocity joint="pole" actrange="-1 1"/>')
     with pytest.raises(ValueError, match="activation"):
         compile_step(mujoco.MjModel.from_xml_string(activated))
-    with pytest.raises(ValueError, match="scalar, mjx"):
+    with pytest.raises(ValueError, match="scalar, mjx, mujoco"):
         compile_step(models.make("cart-pole"), physics="c")
+    with pytest.raises(ValueError, match=r"model.body_mass: .* have the model as it is"):
+        compile_step(models.make("cart-pole"), inputs=("qpos", "qvel", "model.body_mass"), physics="mujoco")
     unsupported = models.chain(models.pole(), option='<option integrator="implicit"/>')
     with pytest.raises(MujocoModelError, match="MJX cannot step it"):
         compile_step(mujoco.MjModel.from_xml_string(unsupported))

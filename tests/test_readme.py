@@ -1,15 +1,15 @@
-"""What the README says can be done, done; its two set-up commands are run by `.ci/run`."""
+"""What the README and docs/deploy.md say can be done, done; the two set-up commands are run by `.ci/run`."""
 
 import re
 import shlex
 from pathlib import Path
 
 ROOT = Path(__file__).parent.parent
-README = (ROOT / "README.md").read_text(encoding="utf-8")
+README, DEPLOY = ((ROOT / name).read_text(encoding="utf-8") for name in ("README.md", "docs/deploy.md"))
 
 
-def blocks(language):
-    return re.findall(rf"```{language}\n(.*?)```", README, re.DOTALL)
+def blocks(language, text=README):
+    return re.findall(rf"```{language}\n(.*?)```", text, re.DOTALL)
 
 
 def test_python_examples_run():
@@ -20,10 +20,10 @@ def test_python_examples_run():
 
 def test_commands_run(command, tmp_path):
     """Each with a few steps only; run folders below a temporary folder."""
-    lines = [
-        line for block in blocks("bash") for line in block.splitlines() if line.startswith(".venv/bin/python -m jaxpg")
-    ]
-    assert len(lines) == 8
+    both = [*blocks("bash"), *blocks("bash", DEPLOY)]
+    lines = [line for block in both for line in block.splitlines() if line.startswith(".venv/bin/python -m jaxpg")]
+    lines = [*dict.fromkeys(lines)]  # the second page begins with a command of the first
+    assert len(lines) == 12
     tiny = ["num_envs=2", "num_steps=2", "eval_episodes=2"]
     for line in lines:
         _, _, module, *arguments = shlex.split(line)
@@ -46,5 +46,5 @@ def test_ci_runs_the_set_up_commands():
 
 
 def test_named_files_exist():
-    for path in re.findall(r"(?:experiments|docs)/[\w/]+\.\w+", README):
+    for path in re.findall(r"(?:experiments|docs)/[\w/]+\.\w+", README + DEPLOY):
         assert (ROOT / path).exists(), path

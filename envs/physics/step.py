@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING
 import jax
 import jax.numpy as jnp
 
+from envs.physics.callback import callback_step
 from envs.physics.interpreter import Program, trace
 from envs.physics.models import import_mjx, model_name, put_model
 from envs.physics.rules import UnsupportedPrimitive
@@ -29,7 +30,7 @@ logger = logging.getLogger(__name__)
 
 StepFn = Callable[..., tuple[jax.Array, ...]]
 
-PHYSICS = ("scalar", "mjx")
+PHYSICS = ("scalar", "mjx", "mujoco")
 STATE = ("qpos", "qvel", "act", "qacc_warmstart", "time")  # what a step hands on to the next one
 MODEL = "model."
 
@@ -55,7 +56,7 @@ def compile_step(
         in MuJoCo, what is derived from the positions (xpos, site_xpos, sensordata, ...) belongs to the state before
         that substep.
       physics: "scalar": scalar equations, or `mjx.step` with a logged line that says why if the model has none;
-        "mjx": `mjx.step`.
+        "mjx": `mjx.step`; "mujoco": C MuJoCo's step, called back for each environment, which is slow.
 
     Returns:
       A function of the inputs (SI units; ctrl in the actuators' units) of one environment. A NaN in the state stays
@@ -78,6 +79,8 @@ def compile_step(
         except UnsupportedPrimitive as error:
             logger.warning("%s: stepped by mjx.step, not as scalar equations: %s", model_name(model), error)
             model, physics = _without_lapack(model), "mjx"
+    if physics == "mujoco":
+        repeated = callback_step(model, num_substeps, inputs, results)
     if physics == "mjx":
         once, _ = single_step(model, inputs, results)
 

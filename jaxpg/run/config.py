@@ -22,7 +22,7 @@ from jaxpg.run.errors import UserError
 from jaxpg.run.schema import GROUPS, LARGEST, Gaussian, Run, option_fields
 
 DEFAULT_CHOICES = {"env": "pendulum", "algo": "td", "network": "mlp"}  # algo: the first that the environment has tuned
-FOLDERS = ("run_dir", "resume", "run")  # options whose value is a path
+FOLDERS = ("run_dir", "resume", "run", "out")  # options whose value is a path
 DEFAULT_ROLLOUT = 16  # steps of a TD rollout where neither the user nor the environment says
 
 

@@ -183,13 +183,31 @@ class EvaluateOptions:
     run: str | None = option(None, "run folder; required")
     episodes: int = option(200, "episodes to play", at_least=2)
     seed: int = option(0, "fixes the starts", at_least=0, at_most=2**32 - 1)
-    backend: str = option("mjx", "the run's own environment, or Gymnasium's", choices=("mjx", "gymnasium"))
+    backend: str = option(
+        "mjx", "the run's own environment, the same in C MuJoCo, or Gymnasium's", choices=("mjx", "mujoco", "gymnasium")
+    )
+    policy: str = option("jax", "as trained, or as exported", choices=("jax", "c", "onnx", "stablehlo"))
     checkpoint: str = option(
         "best", "the best policy by the evaluations while training, or the last", choices=("best", "last")
     )
     agent: int | None = option(None, "which of several agents, from 0 [default: the best]", at_least=0)
     cache: bool = option(True, "keep the compiled program in the user's cache folder, for the next evaluation")
     json: bool = option(False, "end with one line of JSON: mean, stderr, episodes, success")
+
+
+@dataclass(frozen=True)
+class ExportOptions:
+    """Options of the export."""
+
+    run: str | None = option(None, "run folder; required")
+    format: str = option(
+        "c", "a C99 header, an ONNX model, a StableHLO program", choices=("c", "onnx", "stablehlo", "all")
+    )
+    out: str | None = option(None, "folder to write into [default: export in the run folder]")
+    checkpoint: str = option(
+        "best", "the best policy by the evaluations while training, or the last", choices=("best", "last")
+    )
+    agent: int | None = option(None, "which of several agents, from 0 [default: the best]", at_least=0)
 
 
 @dataclass(frozen=True)

@@ -7,6 +7,7 @@ import statistics
 import sys
 import threading
 import time
+from collections import deque
 from collections.abc import Iterator
 from contextlib import contextmanager
 
@@ -17,6 +18,7 @@ from jaxpg.compatibility import may_deadlock
 PATIENCE = 10.0  # times the median chunk
 AT_LEAST = 120.0  # seconds
 PULSE = 1.0  # seconds between two looks
+RECENT = 101  # chunks that the median is of
 
 
 class Watchdog:
@@ -31,7 +33,7 @@ class Watchdog:
 
     def __init__(self, at_least: float = AT_LEAST, patience: float = PATIENCE, pulse: float = PULSE):
         self._at_least, self._patience, self._pulse = at_least, patience, pulse
-        self._durations: list[float] = []
+        self._durations: deque[float] = deque(maxlen=RECENT)
 
     @property
     def limit(self) -> float:

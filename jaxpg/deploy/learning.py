@@ -1,0 +1,74 @@
+"""The same steps learned from by JAX and by what was written, to be compared."""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxpg.actor_critic import sampling_policy
+from jaxpg.networks import Networks, linear_mean
+from jaxpg.online import Traces, trace_update
+from jaxpg.rollout import rollout
+from jaxpg.run.policies import StoredPolicy
+from jaxpg.run.program import make_networks
+from jaxpg.run.schema import Online
+from jaxpg.run.state import Policy
+from jaxpg.types import PyTree, Transition
+from jaxpg.vector_env import vectorize
+
+NUM_STEPS = 1000
+
+
+def steps(stored: StoredPolicy) -> Transition:
+    """Steps of one environment under the policy with its noise, `[T, 1, ...]`."""
+    networks = make_networks(stored.config, stored.env)
+    vector = vectorize(stored.env, 1, stored.config.env.episode_length)
+    key_reset, key_rollout = jax.random.split(jax.random.key(1))
+
+    @jax.jit
+    def play(policy):
+        act = sampling_policy(networks, policy.params, policy.normalizer)
+        return rollout(act, vector.step, vector.reset(key_reset), key_rollout, NUM_STEPS)[1]
+
+    return play(stored.policy)
+
+
+def rows(transition: Transition) -> np.ndarray:
+    """Steps as the written example reads them, `[T, 2 n + m + 3]`."""
+    one = jax.tree.map(lambda x: np.asarray(x)[:, 0], transition)
+    ends = one.reward, one.next_obs, one.terminated, one.truncated
+    return np.concatenate([x.reshape(len(one.obs), -1) for x in (one.obs, one.u, *ends)], axis=1)
+
+
+def learned(
+    networks: Networks, options: Online, policy: Policy, log_std: np.ndarray, transition: Transition
+) -> jax.Array:
+    """W, b, log sigma, w and c after each of the steps, `[T, P]`, by `jaxpg.online.trace_update`.
+
+    Args:
+      networks: linear.
+      options: of the algorithm.
+      policy: before the first step; its observation statistics stay as they are.
+      log_std: log sigma `[m]`, where it is none of the parameters.
+      transition: of one environment, `[T, 1, ...]`.
+    """
+    names = ("gamma", "lambda_actor", "lambda_critic", "actor_lr", "critic_lr", "reward_scale", "discounted")
+    update = trace_update(networks, **{name: getattr(options, name) for name in names})
+
+    def flat(params: PyTree) -> jax.Array:
+        weight, bias = linear_mean(params["actor"])
+        sigma = params["actor"]["params"].get("log_std", log_std)
+        value = params["critic"]["params"]["Dense_0"]
+        return jnp.concatenate([weight.T.ravel(), bias, sigma, value["kernel"].ravel(), value["bias"]])
+
+    def step(carry, transition):
+        params, traces, _ = update(*carry, policy.normalizer, transition)
+        return (params, traces), flat(params)
+
+    def learn(params, transition):
+        zeros = jax.tree.map(lambda x: jnp.zeros((1, *x.shape), x.dtype), params)
+        traces = Traces(zeros["actor"], zeros["critic"], jnp.ones_like(transition.reward[0]))
+        return jax.lax.scan(step, (params, traces), transition)[1]
+
+    return jax.jit(learn)(policy.params, transition)

@@ -1,0 +1,156 @@
+"""A controller as an ONNX model: `observation` `[batch, n]` to `command` `[batch, m]`, for any batch."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from jaxpg.deploy.controller import Controller
+from jaxpg.features import BOUND
+from jaxpg.run.errors import UserError
+
+OPSET = 18  # of 2022: what runtimes of robots have learned since then
+IR_VERSION = 8  # which goes with it
+
+
+class Graph:
+    """The nodes and constants of a model while it is written; a value is its name."""
+
+    def __init__(self, helper: Any, numpy_helper: Any):
+        self._helper, self._numpy_helper = helper, numpy_helper
+        self.nodes: list[Any] = []
+        self.constants: list[Any] = []
+
+    def constant(self, value: Any, dtype: type = np.float32) -> str:
+        name = f"constant_{len(self.constants)}"
+        self.constants.append(self._numpy_helper.from_array(np.asarray(value, dtype), name))
+        return name
+
+    def node(self, kind: str, *inputs: str, name: str | None = None, **attributes: Any) -> str:
+        name = name or f"{kind.lower()}_{len(self.nodes)}"
+        self.nodes.append(self._helper.make_node(kind, list(inputs), [name], **attributes))
+        return name
+
+    def columns(self, x: str, places: list[int]) -> str:
+        """The given columns of `[batch, n]`."""
+        return self.node("Gather", x, self.constant(places, np.int64), axis=1)
+
+
+def write(controller: Controller, folder: Path) -> list[Path]:
+    """Writes NAME.onnx into `folder`; returns its path.
+
+    Raises:
+      UserError: onnx is not installed.
+    """
+    try:
+        from onnx import TensorProto, checker, helper, numpy_helper, save
+    except ImportError:
+        raise UserError("format=onnx needs onnx and onnxruntime: pip install onnx onnxruntime") from None
+    graph = Graph(helper, numpy_helper)
+    _command(graph, controller)
+    values = [
+        helper.make_tensor_value_info(name, TensorProto.FLOAT, ["batch", size])
+        for name, size in (("observation", controller.observation_size), ("command", controller.action_size))
+    ]
+    made = helper.make_graph(graph.nodes, controller.name, values[:1], values[1:], graph.constants)
+    model = helper.make_model(made, opset_imports=[helper.make_opsetid("", OPSET)], producer_name="jaxpg")
+    model.ir_version = IR_VERSION
+    names, commands, limits = controller.interface
+    about = {"observations": "; ".join(names), "commands": "; ".join(commands), "limits": str(limits)}
+    helper.set_model_props(model, controller.origin | about)
+    checker.check_model(model, full_check=True)
+    path = folder / f"{controller.name}.onnx"
+    save(model, path)
+    return [path]
+
+
+def load(controller: Controller, folder: Path) -> Callable[[np.ndarray], np.ndarray]:
+    """The written controller, `[N, n]` to `[N, m]`, in onnxruntime.
+
+    Raises:
+      UserError: onnxruntime is not installed.
+    """
+    try:
+        import onnxruntime
+    except ImportError:
+        raise UserError("format=onnx is tried out by onnxruntime: pip install onnxruntime") from None
+    path = str(folder / f"{controller.name}.onnx")
+    session = onnxruntime.InferenceSession(path, providers=["CPUExecutionProvider"])
+    return lambda obs: session.run(["command"], {"observation": obs})[0]
+
+
+def _command(graph: Graph, controller: Controller) -> None:
+    centred = graph.node("Sub", "observation", graph.constant(controller.mean))
+    z = graph.node("Mul", centred, graph.constant(controller.scale))
+    x = FEATURES[controller.features](graph, z, controller)
+    for layer in controller.layers[:-1]:
+        x = ACTIVATIONS[controller.activation](graph, _layer(graph, x, layer))
+    action = _layer(graph, x, controller.layers[-1])
+    if controller.squash:
+        action = graph.node("Tanh", action)
+    if controller.interface.limits is None:
+        graph.node("Identity", action, name="command")
+    else:
+        action = graph.node("Clip", action, graph.constant(-1), graph.constant(1))
+        graph.node("Mul", action, graph.constant(controller.interface.limits), name="command")
+
+
+def _layer(graph: Graph, x: str, layer: Any) -> str:
+    return graph.node("Gemm", x, graph.constant(layer.weight), graph.constant(layer.bias))
+
+
+def _polynomial(graph: Graph, z: str, controller: Controller) -> str:
+    size, before = controller.observation_size, [(i,) for i in range(controller.observation_size)]
+    degrees = [z]
+    for degree in range(2, controller.order + 1):
+        place, before = (
+            {c: i for i, c in enumerate(before)},
+            [*itertools.combinations_with_replacement(range(size), degree)],
+        )
+        rest = graph.columns(degrees[-1], [place[c[:-1]] for c in before])
+        degrees.append(graph.node("Mul", rest, graph.columns(z, [c[-1] for c in before])))
+    return graph.node("Concat", *degrees, axis=1)
+
+
+def _fourier(graph: Graph, z: str, controller: Controller) -> str:
+    inside = graph.node("Clip", z, graph.constant(-BOUND), graph.constant(BOUND))
+    unit = graph.node("Div", graph.node("Add", inside, graph.constant(BOUND)), graph.constant(2 * BOUND))
+    frequencies = [*itertools.product(range(controller.order + 1), repeat=controller.observation_size)][1:]
+    angle = graph.node(
+        "MatMul", graph.node("Mul", unit, graph.constant(np.pi)), graph.constant(np.transpose(frequencies))
+    )
+    return graph.node("Cos", angle)
+
+
+def _radial(graph: Graph, z: str, controller: Controller) -> str:
+    order = controller.order
+    axis, width = np.linspace(-BOUND, BOUND, order), 2 * BOUND / (order - 1)
+    bumps = None
+    for i in range(controller.observation_size):
+        away = graph.node("Div", graph.node("Sub", graph.columns(z, [i]), graph.constant(axis)), graph.constant(width))
+        energy = graph.node("Mul", graph.node("Mul", away, away), graph.constant(-0.5))
+        own = graph.node("Softmax", energy, axis=1)
+        if bumps is None:
+            bumps = own
+            continue
+        one, two = (graph.node("Unsqueeze", x, graph.constant([axis], np.int64)) for x, axis in ((bumps, 2), (own, 1)))
+        bumps = graph.node("Reshape", graph.node("Mul", one, two), graph.constant([-1, order ** (i + 1)], np.int64))
+    return bumps
+
+
+FEATURES = {
+    "identity": lambda graph, z, controller: z,
+    "polynomial": _polynomial,
+    "fourier": _fourier,
+    "radial": _radial,
+}
+ACTIVATIONS = {
+    "tanh": lambda graph, x: graph.node("Tanh", x),
+    "relu": lambda graph, x: graph.node("Relu", x),
+    "elu": lambda graph, x: graph.node("Elu", x),
+    "swish": lambda graph, x: graph.node("Mul", x, graph.node("Sigmoid", x)),
+}
