@@ -113,7 +113,7 @@ MISTAKES = {
     ),
     "no rewards to sum": (["algo.estimator=n_step", "algo.n=0"], "algo.n=0: must be at least 1"),
     "environments that do not divide": (
-        ["algo=ppo", "num_envs=64", "algo.minibatches=5"],
+        ["algo=ppo", "num_envs=64", "algo.num_shards=1", "algo.minibatches=5"],
         "algo.minibatches=5 does not divide num_envs=64: the nearest that does is 4",
     ),
     "environments of a shard that do not divide": (
@@ -209,7 +209,7 @@ RUN_MISTAKES = {
     "misspelt on resume": (train, ["resume={run}", "totl_steps=9"], "did you mean 'total_steps'?"),
     "no run": (evaluate, [], "run=DIR is missing"),
     "folder that is no run": (evaluate, ["run={run}/tb"], "is not a run folder"),
-    "misspelt backend": (evaluate, ["run={run}", "backend=gym"], "must be mjx or gymnasium"),
+    "misspelt backend": (evaluate, ["run={run}", "backend=gym"], "must be mjx or mujoco or gymnasium"),
     "misspelt evaluation option": (evaluate, ["run={run}", "episode=3"], "did you mean 'episodes'?"),
     "one episode": (evaluate, ["run={run}", "episodes=1"], "episodes=1: must be at least 2"),
     "no such agent": (evaluate, ["run={run}", "agent=1"], "agent=1: the run has agents 0 to 0"),

@@ -237,8 +237,9 @@ def test_a_sweep_resumed_is_the_sweep_never_stopped(swept, command, tmp_path):
     assert digests(folder) == digests(whole)
 
 
-# With mjx, brax's default here, it takes two minutes to compile.
-@pytest.mark.parametrize("backend", ["spring", pytest.param("mjx", marks=pytest.mark.study)])
+# With mjx, brax's default here, it takes two minutes to compile, with spring one.
+@pytest.mark.study
+@pytest.mark.parametrize("backend", ["spring", "mjx"])
 def test_brax_environments_train(command, tmp_path, backend):
     folder = tmp_path / "run"
     brax = ("env=brax", "env.name=inverted_pendulum", f"env.backend={backend}", "env.episode_length=8")

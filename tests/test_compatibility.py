@@ -24,7 +24,7 @@ def test_the_installed_release_sums_right_or_is_refused():
     assert wrong_sums() == 0
 
 
-@pytest.mark.parametrize("environment", [pytest.param("pendulum", marks=pytest.mark.study), "arm"])
+@pytest.mark.parametrize("environment", ["pendulum", pytest.param("arm", marks=pytest.mark.study)])
 def test_the_training_program_makes_no_lapack_call(environment):
     """Neither the start nor the updates of two agents at once: batched LAPACK calls hang on some releases."""
     sizes = ("num_seeds=2", "num_envs=8", "num_steps=2", "total_steps=32", "eval_episodes=2")

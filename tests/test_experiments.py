@@ -39,6 +39,7 @@ def experiments(monkeypatch, command_environment, tmp_path):
         sys.modules.pop(name, None)
 
 
+@pytest.mark.study
 def test_default_runs(experiments, monkeypatch):
     import default_runs
 

@@ -1,5 +1,6 @@
 """A policy leaves the library as C, ONNX or StableHLO, and commands what JAX commands."""
 
+import functools
 import json
 import re
 import subprocess
@@ -10,6 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+import envs
 from jaxpg import evaluate
 from jaxpg import export as command_line
 from jaxpg.actor_critic import deterministic_policy
@@ -22,14 +24,15 @@ from jaxpg.normalization import RunningStatistics
 from jaxpg.run.config import compose
 from jaxpg.run.errors import UserError
 from jaxpg.run.policies import StoredPolicy
-from jaxpg.run.program import make_env, make_networks
+from jaxpg.run.program import make_networks
 from jaxpg.run.state import Policy
 from jaxpg.types import Transition
 
+RELU = ("network.activation=relu",)
 POLICIES = {
     "two commands": ("env=arm", "network.widths=[16,8]", "network.activation=tanh"),
     "velocities": ("env=arm", "env.control=velocity", "network.widths=[8]", "network.activation=elu"),
-    "products": ("env=pendulum", "network.features=polynomial", "network.order=3", "network.activation=relu"),
+    "products": ("env=pendulum", "network.features=polynomial", "network.order=3", "network.widths=[8]", *RELU),
     "not squashed": ("env=pendulum", "network.squash=false", "network.activation=swish"),
     "linear": ("env=pendulum", "network=linear", "network.features=polynomial", "network.order=1"),
     "frequencies": ("env=pendulum", "network=linear", "network.features=fourier", "network.order=3"),
@@ -40,10 +43,16 @@ POLICIES = {
 }
 
 
+@functools.cache
+def an_env(name, options):
+    return envs.REGISTRY[name].build(options)
+
+
+@functools.cache
 def a_policy(*options):
     """A stored policy whose numbers are drawn, larger than those that training begins with."""
     config = compose(options)
-    env = make_env(config)
+    env = an_env(config.choices["env"], config.env)
     networks, keys = make_networks(config, env), iter(jax.random.split(jax.random.key(0), 100))
     params = networks.init(next(keys))
     params = jax.tree.map(lambda x: x + 0.1 * jax.random.normal(next(keys), x.shape), params)
@@ -152,11 +161,11 @@ def test_stablehlo_is_read_without_this_library(written, tmp_path):
 
 # --- going on with learning -------------------------------------------------------------------------------------------
 
-ONLINE = ("algo=online", "network=linear", "network.squash=false")
+ONLINE = ("algo=online", "network=linear", "algo.actor_lr=1e-5", "algo.critic_lr=1e-4")
 LEARNERS = {
-    "sigma learned": ("env=pendulum", *ONLINE, "network.features=polynomial", "network.order=2", "algo.actor_lr=3e-5"),
+    "sigma learned": ("env=pendulum", *ONLINE, "network.features=polynomial", "network.order=2"),
     "discounted": ("env=pendulum", *ONLINE, "network.sigma_is=fixed", "algo.discounted=true", "algo.lambda_actor=0.5"),
-    "two commands": ("env=arm", *ONLINE, "network.squash=true", "algo.reward_scale=0.5"),
+    "two commands": ("env=arm", *ONLINE, "network.squash=true", "algo.reward_scale=0.5", "network.features=identity"),
 }
 
 
@@ -198,7 +207,7 @@ def test_a_thousand_updates_in_c_are_those_of_jax(name, double, tmp_path):
         assert expected.dtype == kind
         expected = np.asarray(expected)
     assert found.shape == expected.shape
-    assert np.abs(expected[-1] - expected[0]).max() > 1e-2  # it has learned
+    assert np.abs(expected[-1] - expected[0]).max() > 1e-3  # it has learned
     np.testing.assert_allclose(found, expected, rtol=0, atol=1e-9 if double else 1e-4)
     header = (tmp_path / f"{control.name}.h").read_text()
     assert ("z->log_sigma[j] = keep_actor" in header) == (stored.config.network.sigma_is == "learned")

@@ -118,7 +118,7 @@ def trees(draw):
     return models.chain(body(0))
 
 
-@settings(deadline=None, max_examples=4)
+@settings(deadline=None, max_examples=2)
 @given(trees(), st.integers(0, 100))
 def test_random_trees(xml, seed):
     """C MuJoCo's to 1e-10, in float64."""

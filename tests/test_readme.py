@@ -4,6 +4,8 @@ import re
 import shlex
 from pathlib import Path
 
+import pytest
+
 ROOT = Path(__file__).parent.parent
 README, DEPLOY = ((ROOT / name).read_text(encoding="utf-8") for name in ("README.md", "docs/deploy.md"))
 
@@ -18,12 +20,13 @@ def test_python_examples_run():
         exec(compile(code, "README.md", "exec"), {})
 
 
-def test_commands_run(command, tmp_path):
+@pytest.mark.parametrize(("text", "number"), [(README, 10), pytest.param(DEPLOY, 4, marks=pytest.mark.study)])
+def test_commands_run(command, tmp_path, text, number):
     """Each with a few steps only; run folders below a temporary folder."""
-    both = [*blocks("bash"), *blocks("bash", DEPLOY)]
-    lines = [line for block in both for line in block.splitlines() if line.startswith(".venv/bin/python -m jaxpg")]
-    lines = [*dict.fromkeys(lines)]  # the second page begins with a command of the first
-    assert len(lines) == 12
+    blocks_of_commands = blocks("bash", text)
+    lines = [line for block in blocks_of_commands for line in block.splitlines() if "/python -m jaxpg" in line]
+    lines = [line for line in lines if not line.startswith("python3 -m venv")]
+    assert len(lines) == number
     tiny = ["num_envs=2", "num_steps=2", "eval_episodes=2"]
     for line in lines:
         _, _, module, *arguments = shlex.split(line)
