@@ -72,7 +72,6 @@ TRAINING = {
         "total_steps": 6_000_000,
         "log_interval": 100_000,
         "eval_interval": 500_000,
-        "checkpoint_interval": 2_000_000,
         "algo.epochs": 4,
         "algo.num_shards": 2,
         "algo.minibatches": 8,
@@ -92,7 +91,6 @@ TRAINING = {
         "total_steps": 18_000_000,
         "log_interval": 100_000,
         "eval_interval": 500_000,
-        "checkpoint_interval": 2_000_000,
         "algo.gamma": 0.9,
         "algo.final_lr": 0.01,
         "algo.reward_scale": 5.0,
@@ -103,7 +101,6 @@ TRAINING = {
         "total_steps": 8_000_000,
         "log_interval": 100_000,
         "eval_interval": 500_000,
-        "checkpoint_interval": 2_000_000,
         "algo.gamma": 0.9,
     },
 }

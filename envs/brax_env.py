@@ -14,9 +14,10 @@ from typing import Any
 
 from envs.options import OptionError, option, unknown
 
+# Steps are slow: a checkpoint is due after fewer of them.
 TRAINING = {
-    "td": {"num_envs": 64, "total_steps": 2_000_000, "eval_episodes": 16},
-    "reinforce": {"num_envs": 16, "total_steps": 2_000_000, "eval_episodes": 16},
+    "td": {"num_envs": 64, "total_steps": 2_000_000, "eval_episodes": 16, "checkpoint_interval": 500_000},
+    "reinforce": {"num_envs": 16, "total_steps": 2_000_000, "eval_episodes": 16, "checkpoint_interval": 500_000},
 }
 
 

@@ -156,7 +156,7 @@ class Run:
         "an update whose numbers are not finite: its agent stops before it, or goes on without",
         choices=POLICIES,
     )
-    checkpoint_interval: int = option(1_000_000, "environment steps between two checkpoints", at_least=1)
+    checkpoint_interval: int = option(5_000_000, "environment steps between two checkpoints", at_least=1)
     run_dir: str | None = option(None, "run folder [default: runs/<env>-<algo>-s<seed>-<time>]")
     cache: bool = option(True, "keep compiled programs in the user's cache folder, for the next run")
 
