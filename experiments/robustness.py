@@ -41,7 +41,7 @@ def seconds_to_exit(folder: Path, arguments: tuple[str, ...], fraction: float) -
     command = [sys.executable, "-m", "jaxpg.train", *arguments, f"run_dir={folder}"]
     log = RunFolder(folder).metrics
     with subprocess.Popen(command, stdout=subprocess.DEVNULL) as process:
-        while not (log.exists() and log.read_bytes().count(b"\n") >= 1 + fraction * 5):
+        while process.poll() is None and not (log.exists() and log.read_bytes().count(b"\n") >= 1 + fraction * 5):
             time.sleep(0.005)
         time.sleep(0.3 * fraction)
         began = time.monotonic()
