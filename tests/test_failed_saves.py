@@ -173,3 +173,18 @@ def test_checkpoints_of_a_run_that_is_gone_are_not_kept_elsewhere(tmp_path):
     (tmp_path / "run").mkdir()
     checkpoints.save(1, {"x": np.ones(2)}, {})
     assert checkpoints.newest_sound() == (1, [])
+
+
+def test_a_checkpoint_is_on_the_disk_before_its_save_returns(tmp_path, monkeypatch):
+    """Every file and folder of it, and the folder that has its name."""
+    synchronized, fsync = set(), os.fsync
+
+    def note(descriptor):
+        synchronized.add(os.readlink(f"/proc/self/fd/{descriptor}"))
+        fsync(descriptor)
+
+    monkeypatch.setattr(os, "fsync", note)
+    Checkpoints(tmp_path).save(3, {"x": np.arange(4.0)}, {})
+    there = {str(path) for path in (tmp_path / "3").rglob("*")} | {str(tmp_path / "3"), str(tmp_path)}
+    assert len(there) > 5
+    assert there <= synchronized
