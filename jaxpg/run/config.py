@@ -45,6 +45,11 @@ class Config:
     sweep: Mapping[str, list[float]] = field(default_factory=dict)
 
     @property
+    def num_shards(self) -> int:
+        """Parts of each agent's environments; algorithms that do not divide them have one."""
+        return getattr(self.algo, "num_shards", 1)
+
+    @property
     def num_agents(self) -> int:
         return len(sweeping.settings(self.sweep)) * self.run.num_seeds
 
@@ -105,7 +110,7 @@ def _conflicts_of_the_algorithm(config: Config) -> Iterator[str]:
             yield "algo.baseline=leave_one_out needs other episodes: num_envs must be at least 2"
         if algo.discounted and algo.returns == "whole":
             yield "algo.discounted=true: whole returns have the factors gamma^t in them; leave it out"
-    shards = getattr(algo, "num_shards", 1)
+    shards = config.num_shards
     if run.num_envs % shards:
         yield _does_not_divide("algo.num_shards", shards, f"num_envs={run.num_envs}", run.num_envs)
     elif config.choices["algo"] == "ppo" and run.num_envs // shards % algo.minibatches:

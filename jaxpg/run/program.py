@@ -133,7 +133,7 @@ def make_networks(config: Config, env: Any) -> Networks:
 
 def make_algorithm(config: Config, env: Any) -> Algorithm:
     """One agent's algorithm, as pure functions."""
-    algo, run, number = config.algo, config.run, num_shards(config)
+    algo, run, number = config.algo, config.run, config.num_shards
     batch = vectorize(env, run.num_envs // number, training_length(config))
     networks = make_networks(config, env)
     if config.choices["algo"] == "online":
@@ -153,14 +153,9 @@ def make_algorithm(config: Config, env: Any) -> Algorithm:
     return shards.sharded(algorithm, number, jax.devices()) if number > 1 else algorithm
 
 
-def num_shards(config: Config) -> int:
-    """Parts of each agent's environments."""
-    return getattr(config.algo, "num_shards", 1)
-
-
 def groups_at_once(config: Config) -> int:
     """Groups of agents that compute at the same time: with shards, which meet, one could wait for another for ever."""
-    return num_threads() if num_shards(config) == 1 else 1
+    return num_threads() if config.num_shards == 1 else 1
 
 
 def training_length(config: Config) -> int:
@@ -263,7 +258,7 @@ def compile_program(
 
     def play(policy):
         starts = jax.random.split(jax.random.key(SELECTION_SEED), run.eval_episodes)
-        parts = math.gcd(run.eval_episodes, num_shards(config))
+        parts = math.gcd(run.eval_episodes, config.num_shards)
         return shards.in_parts(play_from, parts, jax.devices())(policy, starts)
 
     init, advance, play = (over_agents(fn, run.vmap_seeds) for fn in (init, advance, play))

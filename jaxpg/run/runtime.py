@@ -33,7 +33,7 @@ def prepare(config: Config, threads: int | None = None) -> None:
         threads = 1
     os.environ["PJRT_NPROC"] = str(threads or num_threads())
     with contextlib.suppress(RuntimeError):  # where the process has computed something already, with what it has
-        jax.config.update("jax_num_cpu_devices", getattr(config.algo, "num_shards", 1))
+        jax.config.update("jax_num_cpu_devices", config.num_shards)
     try:
         jax.devices()
     except (RuntimeError, AssertionError) as error:  # the latter, without words, where jax has no plugin for it
