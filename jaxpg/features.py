@@ -40,9 +40,17 @@ def polynomial(x: jax.Array, order: int) -> jax.Array:
     >>> polynomial(jnp.array([2.0, 3.0]), 2).tolist()
     [2.0, 3.0, 4.0, 6.0, 9.0]
     """
+    return jnp.stack([math.prod(x[..., i] for i in c) for c in monomials(x.shape[-1], order)], axis=-1)
+
+
+def monomials(size: int, order: int) -> list[tuple[int, ...]]:
+    """The factors of each of the `polynomial` features, by their places in the observation.
+
+    >>> monomials(2, 2)
+    [(0,), (1,), (0, 0), (0, 1), (1, 1)]
+    """
     degrees = range(1, order + 1)
-    factors = [c for degree in degrees for c in itertools.combinations_with_replacement(range(x.shape[-1]), degree)]
-    return jnp.stack([math.prod(x[..., i] for i in c) for c in factors], axis=-1)
+    return [c for degree in degrees for c in itertools.combinations_with_replacement(range(size), degree)]
 
 
 def fourier(x: jax.Array, order: int) -> jax.Array:

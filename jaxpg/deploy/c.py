@@ -9,14 +9,13 @@ import os
 import shutil
 import subprocess
 from collections.abc import Callable
-from itertools import combinations_with_replacement
 from pathlib import Path
 
 import numpy as np
 
 from jaxpg.deploy import online
 from jaxpg.deploy.controller import Controller
-from jaxpg.features import BOUND, num_features
+from jaxpg.features import BOUND, monomials, num_features
 from jaxpg.run.errors import UserError
 
 FLAGS = ("-std=c99", "-O2", "-Wall", "-Wextra", "-Wpedantic", "-Werror")
@@ -275,9 +274,8 @@ def _literal(x: np.floating) -> str:
 
 def _factors(size: int, order: int) -> list[tuple[int, int]]:
     """Of each monomial the one without its last factor, and that factor; (0, 0) for those of degree 1."""
-    monomials = [c for degree in range(1, order + 1) for c in combinations_with_replacement(range(size), degree)]
-    place = {c: i for i, c in enumerate(monomials)}
-    return [(place[c[:-1]], c[-1]) if len(c) > 1 else (0, 0) for c in monomials]
+    place = {c: i for i, c in enumerate(monomials(size, order))}
+    return [(place[c[:-1]], c[-1]) if len(c) > 1 else (0, 0) for c in place]
 
 
 def _features(controller: Controller) -> str:
