@@ -1,0 +1,60 @@
+// What the linked views share: which episode of which policy, and where in it.
+
+/** A state whose listeners are called with the names that have changed. */
+function shared(state) {
+  const listeners = [];
+  return {
+    state,
+    listen: (listener) => listeners.push(listener),
+    set(changes) {
+      const changed = Object.keys(changes).filter((name) => state[name] !== changes[name]);
+      Object.assign(state, changes);
+      if (changed.length) for (const listener of listeners) listener(new Set(changed));
+    },
+  };
+}
+
+/** The state at the start: the last but one policy is the best where there are three, so the second is shown. */
+function startOf(data) {
+  const policies = data.player?.policies ?? data.workspace?.points ?? data.portrait?.values ?? [];
+  return { policy: Math.min(1, policies.length - 1), episode: 0, position: 0, speed: 1, playing: false, ghost: false };
+}
+
+const recordings = new WeakMap();
+
+/** An episode with its numbers unpacked, and its return up to each frame. */
+function recorded(episode) {
+  if (!recordings.has(episode)) {
+    const parts = unpack(episode.parts);
+    const motors = unpack(episode.motors);
+    recordings.set(episode, { ...episode, parts, motors, soFar: episode.so_far ?? returnsSoFar(episode) });
+  }
+  return recordings.get(episode);
+}
+
+/** Sums of the rewards; null where they are not the episode's return, as when only every second step is recorded. */
+function returnsSoFar(episode) {
+  const sums = [0];
+  for (const reward of episode.series.reward ?? []) sums.push(sums.at(-1) + (reward ?? 0));
+  const wrong = Math.abs(sums.at(-1) - episode.return);
+  return episode.return !== null && wrong <= 0.001 * Math.abs(episode.return) + 0.01 ? sums : null;
+}
+
+/** The episode that is chosen. */
+function chosen(player, state) {
+  return recorded(player.policies[state.policy].episodes[state.episode]);
+}
+
+/** The same episode by the first policy; null where it is not asked for or is the chosen one. */
+function ghostOf(player, state) {
+  return state.ghost && state.policy > 0 ? recorded(player.policies[0].episodes[state.episode]) : null;
+}
+
+/** The frame that is shown, a whole number. */
+function frameOf(episode, state) {
+  return clamp(Math.floor(state.position + 1e-6), 0, episode.frames - 1);
+}
+
+function decimals(dt) {
+  return clamp(Math.ceil(-Math.log10(dt) - 1e-9), 1, 3);
+}

@@ -1,0 +1,207 @@
+"""What the page of a run is given, made up by closed forms: pendulum, arm, comparison."""
+
+import base64
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+Json = dict[str, Any]
+INT16 = 2**15 - 1
+DT = 0.05
+ROD = 1.0
+LINKS = (0.5, 0.5)
+# What must stay text wherever it stands.
+NASTY = "</script><script>alert(1)</script><!-- <img src=x onerror=alert(2)> &amp; \u2028 \ud800 'a' $data ${style}"
+
+
+def packed(values: np.ndarray) -> str:
+    """Numbers within +-32767 as base64 of little-endian int16."""
+    return base64.b64encode(np.rint(values).astype("<i2").tobytes()).decode("ascii")
+
+
+def curve(label: str, final: float, rate: float, width: float | None = 4.0, number: int = 25) -> Json:
+    """A return that rises from -1200 as an exponential; `width` of its interval at the end, None without one."""
+    steps = np.linspace(0, 960_000, number)
+    mean = final - (1200 + final) * np.exp(-rate * steps / 1e5)
+    spread = None if width is None else width * (1 + 20 * np.exp(-rate * steps / 1e5))
+    low, high = (None, None) if spread is None else ((mean - spread).tolist(), (mean + spread).tolist())
+    return {"label": label, "steps": steps.tolist(), "mean": mean.tolist(), "low": low, "high": high}
+
+
+def document(kind: str, title: str, **parts: Any) -> Json:
+    """Everything that a page is given; parts that are not named are not there."""
+    absent: Json = {"player": None, "portrait": None, "workspace": None, "improvement": None}
+    lists: Json = {"facts": [], "curves": [], "tables": [], "configuration": [], "versions": []}
+    return {"kind": kind, "title": title} | lists | absent | parts
+
+
+def episode(parts: np.ndarray, motors: np.ndarray, goal: Any, series: dict[str, np.ndarray], **more: Any) -> Json:
+    """An EPISODE of ends of capsules `[F, P, 4]` and places of motors `[F, M, 2]`."""
+    scale = max(np.abs(parts).max(), np.abs(motors).max()) / INT16
+    return {
+        "return": float(np.sum(series["reward"])),
+        "success": None,
+        "frames": len(parts),
+        "scale": float(scale),
+        "parts": packed(parts / scale),
+        "motors": packed(motors / scale),
+        "goal": goal,
+        "series": {name: values.tolist() for name, values in series.items()},
+        "path": None,
+    } | more
+
+
+def policies(play: Callable[[int, int], Json], episodes: int = 3) -> list[Json]:
+    """`play(policy, episode)` before and after training."""
+    labels = [("before training", "0 updates"), ("best", "120 updates")]
+    return [
+        {"label": label, "note": note, "episodes": [play(i, k) for k in range(episodes)]}
+        for i, (label, note) in enumerate(labels)
+    ]
+
+
+def wrapped(angle: np.ndarray) -> np.ndarray:
+    """In [-pi, pi)."""
+    return (angle + np.pi) % (2 * np.pi) - np.pi
+
+
+def swing(policy: int, number: int) -> Json:
+    """Before training it turns over and over; afterwards it settles upright, at 0, as a damped oscillator."""
+    time, start = np.arange(0, 101 + 10 * number) * DT, 2.6 - 0.5 * number
+    if policy == 0:
+        angle, speed = start + 3 * time, np.full_like(time, 3.0)
+    else:
+        angle = start * np.exp(-time) * np.cos(3 * time)
+        speed = -start * np.exp(-time) * (np.cos(3 * time) + 3 * np.sin(3 * time))
+    torque = (0.2 if policy == 0 else 2.0) * np.cos(3 * time[:-1]) * np.exp(-time[:-1] / 2)
+    reward = -(wrapped(angle[:-1]) ** 2) - 0.1 * speed[:-1] ** 2 - 0.001 * torque**2
+    tip = np.stack([-ROD * np.sin(angle), ROD * np.cos(angle)], axis=-1)
+    ends = np.concatenate([np.zeros_like(tip), tip], axis=-1)[:, None]
+    series = {"torque [N m]": torque, "reward": reward, "value": -20 * np.exp(-time[:-1]) * policy}
+    return episode(ends, np.zeros((len(time), 1, 2)), None, series, path=[wrapped(angle).tolist(), speed.tolist()])
+
+
+def value_grid(scale: float) -> Json:
+    """A well along the line on which the pendulum comes to rest."""
+    angle, speed = np.meshgrid(np.linspace(-np.pi, np.pi, 41), np.linspace(-8, 8, 41))
+    values = -scale * (angle**2 + 0.4 * angle * speed + 0.1 * speed**2) + 0.02 * scale
+    low, high = values.min(), values.max()
+    return {"low": float(low), "high": float(high), "data": packed((values - low) / (high - low) * INT16)}
+
+
+def pendulum(**changes: Any) -> Json:
+    """The run of a pendulum: player, phase portrait, one panel of curves."""
+    player = {
+        "dt": DT,
+        "view": [-1.25, -1.25, 1.25, 1.25],
+        "parts": [{"radius": 0.05, "color": "#cc4d4d"}],
+        "motors": [{"name": "torque [N m]", "limit": 2.0, "sign": 1}],
+        "goal_radius": None,
+        "series": ["torque [N m]", "reward", "value"],
+        "policies": policies(swing),
+    }
+    portrait = {
+        "title": "value and phase portrait",
+        "x": {"label": "theta [rad]", "range": [-np.pi, np.pi], "wraps": True},
+        "y": {"label": "theta' [rad/s]", "range": [-8.0, 8.0], "wraps": False},
+        **{"columns": 41, "rows": 41, "values": [value_grid(0.5), value_grid(8.0)]},
+    }
+    parts = {
+        "facts": [["return", "-147.2 at the end, -147.1 at best"], ["steps", "1,000,000"]],
+        "curves": [
+            {
+                "title": "return",
+                "x": "environment steps",
+                "series": [curve("deterministic policy", -147.0, 1.2), curve("while training", -160.0, 0.8, None)],
+            }
+        ],
+        "player": player,
+        "portrait": portrait,
+        "configuration": [["env", "pendulum"], ["env.mass", "1.0"], ["algo.gamma", "0.97"]],
+        "versions": [["jax", "0.10.1"], ["mujoco", "3.17.0"]],
+    }
+    return document("run", "ppo on pendulum, seed 0", **parts | changes)
+
+
+def reach(policy: int, number: int) -> Json:
+    """Before training it hardly moves; afterwards its joints go to their goal as exponentials."""
+    time = np.arange(101) * DT
+    goal_angles = np.array([0.6 + 1.9 * number, 1.1])
+    share = (1 - np.exp(-2 * time)) * (1.0 if policy else 0.1)
+    upper, fore = share * goal_angles[0], share * goal_angles.sum()
+    elbow = LINKS[0] * np.stack([np.cos(upper), np.sin(upper)], axis=-1)
+    tip = elbow + LINKS[1] * np.stack([np.cos(fore), np.sin(fore)], axis=-1)
+    goal = LINKS[0] * np.exp(1j * goal_angles[0]) + LINKS[1] * np.exp(1j * goal_angles.sum())
+    distance = np.hypot(tip[:, 0] - goal.real, tip[:, 1] - goal.imag)
+    parts = np.stack([np.concatenate([0 * elbow, elbow], -1), np.concatenate([elbow, tip], -1)], axis=1)
+    torques = {f"{name} torque [N m]": 2 * size * np.exp(-2 * time[:-1]) for name, size in JOINTS.items()}
+    series = torques | {"reward": -distance[:-1], "value": -5 * distance[:-1]}
+    motors = np.stack([0 * elbow, elbow], axis=1)
+    return episode(parts, motors, [goal.real, goal.imag], series, success=bool(distance[-1] < 0.05))
+
+
+JOINTS = {"shoulder": 0.9, "elbow": -0.5}
+
+
+def arm(**changes: Any) -> Json:
+    """The run of an arm: player with a goal, workspace, two panels of curves."""
+    angle, radius = 2.4 * np.arange(120), 0.2 + 0.75 * np.sqrt(np.arange(120) / 120)
+    goals = np.stack([radius * np.cos(angle), radius * np.sin(angle)], axis=-1)
+    number = np.arange(120)
+    reached = (number % 40 == 7, number % 40 != 7)  # 3 before training, 117 afterwards
+    points = [np.column_stack([goals, np.where(x, 0.01, 0.3), x]).tolist() for x in reached]
+    player = {
+        "dt": DT,
+        "view": [-1.1, -1.1, 1.1, 1.1],
+        "parts": [{"radius": 0.03, "color": "#4d66cc"}, {"radius": 0.025, "color": "#4d99e6"}],
+        "motors": [{"name": f"{name} torque [N m]", "limit": 2.0, "sign": 1} for name in JOINTS],
+        "goal_radius": 0.05,
+        "series": [*(f"{name} torque [N m]" for name in JOINTS), "reward", "value"],
+        "policies": policies(reach),
+    }
+    parts = {
+        "facts": [["return", "-11.8 at the end"], ["steps", "1,000,000"]],
+        "curves": [
+            {"title": "return", "x": "environment steps", "series": [curve("deterministic policy", -12.0, 1.0)]}
+        ],
+        "player": player,
+        "workspace": {
+            "title": "success over the workspace",
+            **{"x": "x [m]", "y": "y [m]", "radius": 0.95, "success_radius": 0.05, "points": points},
+        },
+        "configuration": [["env", "arm"]],
+        "versions": [["jax", "0.10.1"]],
+    }
+    return document("run", "ppo on arm, seed 0", **parts | changes)
+
+
+def comparison(**changes: Any) -> Json:
+    """Three runs side by side: two panels of curves, a table, probabilities of improvement."""
+    labels = ["ppo", "td, lambda 0.95", "reinforce"]
+    returns = [curve(label, -147.0 - 20 * i, 1.2 / (1 + i), 4.0 + 5 * i) for i, label in enumerate(labels)]
+    rewards = [curve(label, -1.0 - i, 1.2, None) for i, label in enumerate(labels[:2])]
+    parts = {
+        "facts": [["runs", "3"], ["seeds", "16 of each"]],
+        "curves": [
+            {"title": "return", "x": "environment steps", "series": returns},
+            {"title": "reward", "x": "environment steps", "series": rewards},
+        ],
+        "tables": [
+            {
+                "title": "Runs, the best first",
+                "columns": ["run", "return at the end", "seeds"],
+                "rows": [
+                    [label, f"-{147 + 20 * i}.1 [-{152 + 20 * i}.0, -{143 + 20 * i}.2]", "16"]
+                    for i, label in enumerate(labels)
+                ],
+            }
+        ],
+        "improvement": {
+            "labels": labels,
+            "probability": [[None, 0.81, 0.99], [0.19, None, 0.58], [0.01, 0.42, None]],
+            "low": [[None, 0.7, 0.97], [0.08, None, 0.4], [0.0, 0.24, None]],
+            "high": [[None, 0.92, 1.0], [0.3, None, 0.76], [0.03, 0.6, None]],
+        },
+    }
+    return document("comparison", "3 runs on pendulum", **parts | changes)
