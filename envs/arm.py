@@ -22,6 +22,7 @@ from flax import struct
 from envs.base import ASSETS, Interface, MjxEnv, State, initial_state
 from envs.options import OptionError, option
 from envs.physics import PHYSICS, load_spec
+from envs.scenes import Scene
 
 PULL = 1.0  # weight [m] of the distance beside its square in the precise reward
 STANDARD_GRAVITY = 9.81  # [m/s^2]
@@ -133,6 +134,12 @@ class Arm(MjxEnv):
         places = [f"{name}_{axis} [m]" for name in ("goal", "error") for axis in "xy"]
         return Interface(
             (*angles, *speeds, *places), tuple(f"{joint} {kind} [{unit}]" for joint in joints), (limit, limit)
+        )
+
+    @property
+    def scene(self) -> Scene:
+        return super().scene._replace(
+            goal=lambda state: jnp.append(state.pipeline_state.goal, 0.0), goal_radius=self.config.success_radius
         )
 
     def reset(self, rng: jax.Array) -> State:

@@ -19,6 +19,7 @@ import jax.numpy as jnp
 from flax import struct
 
 from envs.physics import check_once, compile_model, compile_step
+from envs.scenes import Scene
 
 ASSETS = Path(__file__).parent / "assets"
 
@@ -92,6 +93,11 @@ class MjxEnv:
     @property
     def unwrapped(self) -> MjxEnv:
         return self
+
+    @property
+    def scene(self) -> Scene:
+        """How a state looks; a subclass whose state has no `qpos`, or that has a goal, says so."""
+        return Scene(self.model, lambda state: state.pipeline_state.qpos)
 
 
 def initial_state(pipeline_state: Any, obs: jax.Array, metric_names: tuple[str, ...] = ()) -> State:

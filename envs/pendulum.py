@@ -20,6 +20,7 @@ from flax import struct
 from envs.base import ASSETS, Interface, MjxEnv, State, initial_state
 from envs.options import option
 from envs.physics import PHYSICS, load_spec
+from envs.scenes import PhasePlane
 
 
 @dataclass(frozen=True)
@@ -116,6 +117,17 @@ class Pendulum(MjxEnv):
     @property
     def interface(self) -> Interface:
         return Interface(("cos(theta)", "sin(theta)", "theta' [rad/s]"), ("torque [N m]",), (self.config.torque_limit,))
+
+    @property
+    def phase_plane(self) -> PhasePlane:
+        limit = self.config.speed_limit
+        return PhasePlane(
+            labels=("theta [rad]", "theta' [rad/s]"),
+            ranges=((-jnp.pi, jnp.pi), (-limit, limit)),
+            wraps=(True, False),
+            coordinates=lambda state: jnp.concatenate([state.pipeline_state.qpos, state.pipeline_state.qvel]),
+            observe=observe,
+        )
 
     def reset(self, rng: jax.Array) -> State:
         """theta ~ U(-pi, pi), theta' ~ U(-1, 1)."""

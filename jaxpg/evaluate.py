@@ -8,25 +8,22 @@ from collections.abc import Sequence
 from contextlib import AbstractContextManager, nullcontext
 from typing import Any
 
-from envs.options import build
-from jaxpg.run import config, help
+from jaxpg.run import config
+from jaxpg.run.commands import about_a_run
 from jaxpg.run.errors import UserError, run_command
 from jaxpg.run.schema import EvaluateOptions
 
 
 def main(arguments: Sequence[str]) -> int:
     """The evaluation command; returns its exit status."""
-    if {"--help", "-h"} & set(arguments):
-        print(help.run_help("evaluate", EvaluateOptions))
+    of_env = [argument for argument in arguments if argument.startswith("env.")]
+    options = about_a_run("evaluate", EvaluateOptions, [argument for argument in arguments if argument not in of_env])
+    if options is None:
         return 0
+    changes = config.parse(of_env)
     from jaxpg.run import episodes, policies
     from jaxpg.run.cache import compilation_cache, physics_cache
 
-    given = config.parse(arguments)
-    changes = {name: value for name, value in given.items() if name.startswith("env.")}
-    options = build(EvaluateOptions, {name: value for name, value in given.items() if name not in changes})
-    if options.run is None:
-        raise UserError("run=DIR is missing: the folder of the run to evaluate")
     if options.backend == "mujoco":
         changes |= _in_mujoco(options.run)
     with physics_cache(options.cache):

@@ -14,6 +14,7 @@ from jaxpg.run.checkpoint import Checkpoints
 
 LINES = 100  # of metrics; a checkpoint after every tenth
 SIZES = ("env=quadratic", "network=linear", "num_envs=2", "num_steps=4", "log_interval=16", "eval_interval=32")
+SIZES += ("report=false",)  # which takes longer than such a run
 RUN = (*SIZES, "eval_episodes=2", "env.episode_length=8", "checkpoint_interval=160", f"total_steps={16 * LINES}")
 
 

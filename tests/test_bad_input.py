@@ -180,7 +180,7 @@ def test_mistakes_in_training_options(mistake, monkeypatch, capsys, tmp_path):
 @pytest.fixture(scope="module")
 def finished(command, tmp_path_factory):
     folder = tmp_path_factory.mktemp("runs") / "finished"
-    sizes = ("num_envs=2", "num_steps=2", "total_steps=4", "eval_episodes=2", "env.episode_length=4")
+    sizes = ("num_envs=2", "num_steps=2", "total_steps=4", "eval_episodes=2", "env.episode_length=4", "report=false")
     assert command("train", *sizes, f"run_dir={folder}").returncode == 0
     return folder
 

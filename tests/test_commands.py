@@ -20,6 +20,7 @@ TINY = (
     "eval_interval=256",
     "eval_episodes=2",
     "checkpoint_interval=256",
+    "report=false",  # which takes longer than such a run
 )
 LINES = 64  # log lines of the run that is stopped and resumed
 LONG = (*TINY, f"total_steps={64 * LINES}", "env.episode_length=20")

@@ -30,6 +30,7 @@ def experiments(monkeypatch, command_environment, tmp_path):
     def tiny(folder, *arguments):
         kept = [argument for argument in arguments if not argument.startswith("total_steps")]
         sizes = ["num_envs=2", "eval_episodes=4", "env.episode_length=10", "log_interval=20", "eval_interval=20"]
+        sizes += ["report=false"]
         return full(folder, *kept, *sizes, "total_steps=40")
 
     monkeypatch.setattr(commands, "train", tiny)
@@ -188,7 +189,7 @@ def test_online_pendulum(experiments, monkeypatch):
 def test_startup(experiments, monkeypatch):
     import startup
 
-    sizes = ("num_envs=2", "num_steps=4", "eval_episodes=2", "env.episode_length=8", "total_steps=16")
+    sizes = ("num_envs=2", "num_steps=4", "eval_episodes=2", "env.episode_length=8", "total_steps=16", "report=false")
     monkeypatch.setattr(startup, "ARGUMENTS", ("env=quadratic", "network=linear", *sizes))
     startup.main()
     runs = json.loads((experiments / "startup.json").read_text())

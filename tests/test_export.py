@@ -1,6 +1,5 @@
 """A policy leaves the library as C, ONNX or StableHLO, and commands what JAX commands."""
 
-import functools
 import json
 import re
 import subprocess
@@ -10,22 +9,18 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from stored import a_policy
 
-import envs
 from jaxpg import evaluate
 from jaxpg import export as command_line
-from jaxpg.actor_critic import deterministic_policy
 from jaxpg.deploy import c, learning, onnx, stablehlo
 from jaxpg.deploy.controller import commanding, controller, observations
 from jaxpg.deploy.export import FORMATS, TOLERANCE, largest_difference
 from jaxpg.features import FEATURES
 from jaxpg.networks import ACTIVATIONS
-from jaxpg.normalization import RunningStatistics
 from jaxpg.run.config import compose
 from jaxpg.run.errors import UserError
-from jaxpg.run.policies import StoredPolicy
 from jaxpg.run.program import make_networks
-from jaxpg.run.state import Policy
 from jaxpg.types import Transition
 
 RELU = ("network.activation=relu",)
@@ -41,31 +36,6 @@ POLICIES = {
     "sigma of the state": ("env=pendulum", "network.sigma_is=state", "network.widths=[8]"),
     "no limits": ("env=quadratic", "network=linear", "network.squash=false", "env.state_size=3"),
 }
-
-
-@functools.cache
-def an_env(name, options):
-    return envs.REGISTRY[name].build(options)
-
-
-@functools.cache
-def a_policy(*options):
-    """A stored policy whose numbers are drawn, larger than those that training begins with."""
-    config = compose(options)
-    env = an_env(config.choices["env"], config.env)
-    networks, keys = make_networks(config, env), iter(jax.random.split(jax.random.key(0), 100))
-    params = networks.init(next(keys))
-    params = jax.tree.map(lambda x: x + 0.1 * jax.random.normal(next(keys), x.shape), params)
-    normalizer = RunningStatistics(
-        count=jnp.array(100.0),
-        mean=jax.random.normal(next(keys), (env.observation_size,)),
-        variance=jnp.exp(jax.random.normal(next(keys), (env.observation_size,))),
-    )
-
-    def act(policy, obs):
-        return deterministic_policy(networks, policy.params, policy.normalizer)(obs)
-
-    return StoredPolicy(act, Policy(params, normalizer), env, config, "seed 0", update=1)
 
 
 @pytest.fixture(scope="module")
@@ -253,7 +223,8 @@ def test_a_sample_of_the_learner_is_the_policys(tmp_path):
 def run(command, tmp_path_factory):
     folder = tmp_path_factory.mktemp("runs") / "run"
     sizes = ("num_envs=2", "num_steps=4", "total_steps=16", "log_interval=8", "eval_interval=8", "eval_episodes=2")
-    result = command("train", "env=quadratic", "num_seeds=2", *sizes, "env.episode_length=8", f"run_dir={folder}")
+    env = ("env=quadratic", "env.episode_length=8", "num_seeds=2")
+    result = command("train", *env, *sizes, "report=false", f"run_dir={folder}")
     assert result.returncode == 0, result.stderr
     return folder
 

@@ -26,7 +26,8 @@ LEVELS = [
     },
     {"networks", "vector_env"},
     {"rollout", "learning", "actor_critic", "online", "training", "soundness", "shards", "evaluation"},
-    {"run", "deploy", "train", "evaluate", "inspect", "export"},
+    {"run", "deploy", "watch", "train", "evaluate", "inspect", "export", "render", "report", "compare"}
+    | {"__main__", "gymnasium"},
 ]
 FOREIGN = {0: {"jax"}, 1: {"jax", "flax"}, 2: {"jax", "optax"}}
 

@@ -157,7 +157,7 @@ def test_rows_computed_in_parts_are_the_rows(devices):
 # --- whole runs -------------------------------------------------------------------------------------------------------
 
 SIZES = ("env=quadratic", "network=linear", "num_envs=8", "num_steps=4", "log_interval=64", "eval_interval=128")
-RUN = (*SIZES, "algo.num_shards=2", "eval_episodes=4", "checkpoint_interval=640", "total_steps=6400")
+RUN = (*SIZES, "algo.num_shards=2", "eval_episodes=4", "checkpoint_interval=640", "total_steps=6400", "report=false")
 
 
 def test_a_run_in_parts_that_was_stopped_is_the_run_that_was_not(command, command_environment, tmp_path):

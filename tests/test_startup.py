@@ -6,7 +6,7 @@ import pytest
 
 TINY = (
     *("env=quadratic", "network=linear", "num_envs=2", "num_steps=4", "log_interval=16", "eval_interval=32"),
-    *("eval_episodes=2", "env.episode_length=8"),
+    *("eval_episodes=2", "env.episode_length=8", "report=false"),
 )
 PROGRAMS = {"advance", "init", "play"}
 

@@ -7,7 +7,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from jaxpg.run.statistics import bootstrap_interval, interquartile_mean
+from jaxpg.run.statistics import (
+    bootstrap_interval,
+    improvement_interval,
+    interquartile_mean,
+    probability_of_improvement,
+)
 
 numbers = st.floats(-1e3, 1e3)
 scores_of_any_number = st.integers(1, 13).flatmap(lambda size: arrays(np.float64, size, elements=numbers))
@@ -135,3 +140,30 @@ def coverage(confidence, repetitions=200, number=16):
 def test_interval_contains_the_truth_about_as_often_as_it_says(confidence):
     """Standard error 0.035 and 0.015; the percentile bootstrap of 16 seeds is known to be off by some hundredths."""
     assert coverage(confidence) == pytest.approx(confidence, abs=0.1)
+
+
+@few_examples
+@given(scores_of_any_number, scores_of_any_number)
+def test_probability_of_improvement_is_the_u_statistic_of_mann_and_whitney(x, y):
+    u = scipy.stats.mannwhitneyu(x, y, method="asymptotic").statistic
+    assert probability_of_improvement(x, y) == pytest.approx(u / (len(x) * len(y)), abs=1e-12)
+
+
+@few_examples
+@given(scores_of_any_number, scores_of_any_number)
+def test_one_of_two_is_better_or_they_are_equal(x, y):
+    assert probability_of_improvement(x, y) + probability_of_improvement(y, x) == pytest.approx(1, abs=1e-12)
+
+
+def test_the_interval_of_an_improvement_holds_the_truth_as_often_as_it_says():
+    """N(0.5, 1) against N(0, 1) with 10 seeds each: P = Phi(0.5 / sqrt 2) = 0.638; 200 experiments, 0.95 +- 0.016.
+
+    The percentile bootstrap of so few is some per cent too narrow; one with a tenth of its width is caught.
+    """
+    truth, generator, held = scipy.stats.norm.cdf(0.5 / np.sqrt(2)), np.random.default_rng(0), 0
+    for _ in range(200):
+        x, y = generator.normal(0.5, 1, 10), generator.normal(0, 1, 10)
+        low, high = improvement_interval(x, y, resamples=200)
+        assert low <= probability_of_improvement(x, y) <= high
+        held += low <= truth <= high
+    assert 0.86 <= held / 200 <= 0.99

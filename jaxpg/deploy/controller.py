@@ -139,13 +139,13 @@ def interface(env: Any) -> Interface:
 
 def commanding(stored: StoredPolicy) -> Callable[[jax.Array], jax.Array]:
     """`command(obs)`, `[..., n]` to `[..., m]`: the controller as JAX computes it."""
-    limits = interface(stored.env).limits
+    return lambda obs: physical(stored.env, stored.act(stored.policy, obs))
 
-    def command(obs):
-        action = stored.act(stored.policy, obs)
-        return action if limits is None else jnp.array(limits) * jnp.clip(action, -1.0, 1.0)
 
-    return command
+def physical(env: Any, action: jax.Array) -> jax.Array:
+    """What an action `[..., m]` commands in this environment, in physical units and within the limits."""
+    limits = interface(env).limits
+    return action if limits is None else jnp.array(limits) * jnp.clip(action, -1.0, 1.0)
 
 
 def observations(stored: StoredPolicy) -> np.ndarray:

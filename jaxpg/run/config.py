@@ -72,6 +72,7 @@ def from_dict(values: Mapping[str, Any], problems: Sequence[str] = ()) -> Config
       OptionError: lists these, and every unknown name, wrong type and value out of range.
     """
     choices = {group: values[group]["id"] for group in GROUPS}
+    _check_choices(choices)
     problems, parts = list(problems), {}
     rest = {name: value for name, value in values.items() if name not in (*GROUPS, "sweep")}
     sections = [(group, GROUPS[group][choices[group]], dict(values[group])) for group in GROUPS] + [("", Run, rest)]

@@ -4,9 +4,11 @@ config.yaml         the options, complete
 versions.json       what computed it
 metrics.jsonl       one line for each chunk of updates
 tb/                 the same for TensorBoard
+loggers/            what other loggers keep there, where they are asked for
 checkpoints/        the whole training state, the newest few
 best/               the best policy so far
 learning_curve.png  the curve
+report.html         the run as a page: curves, episodes to watch, options
 lock                who is training in it, for as long as it does
 """
 
@@ -19,7 +21,8 @@ import json
 import os
 import platform
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -29,7 +32,9 @@ import numpy as np
 from jaxpg.run import lock
 from jaxpg.run.config import Config
 from jaxpg.run.errors import UserError
-from jaxpg.run.tensorboard import TensorBoard
+from jaxpg.run.loggers import UntilItFails, values_of
+from jaxpg.run.loggers.follower import Follower
+from jaxpg.run.loggers.tensorboard import TensorBoard
 
 UNFINISHED = ".unfinished"  # ends the name of a file that is renamed once it is complete
 RECORDED_PACKAGES = ("jax", "jaxlib", "mujoco", "mujoco-mjx", "brax", "flax", "optax", "orbax-checkpoint", "numpy")
@@ -44,9 +49,11 @@ class RunFolder:
         self.versions = self.path / "versions.json"
         self.metrics = self.path / "metrics.jsonl"
         self.tensorboard = self.path / "tb"
+        self.loggers = self.path / "loggers"
         self.checkpoints = self.path / "checkpoints"
         self.best = self.path / "best"
         self.learning_curve = self.path / "learning_curve.png"
+        self.report = self.path / "report.html"
 
 
 def planned(config: Config) -> RunFolder:
@@ -188,7 +195,7 @@ def num_threads() -> int:
 
 
 class MetricsLog:
-    """`metrics.jsonl` and TensorBoard; on resume, lines after the checkpoint are taken back.
+    """`metrics.jsonl`, TensorBoard and other loggers; on resume, lines after the checkpoint are taken back.
 
     Lines that cannot be written wait in memory, and are written before the next one. The file is opened anew for each:
     the folder may be another's, or gone.
@@ -197,19 +204,24 @@ class MetricsLog:
       folder: the run.
       update: updates made so far; later lines are removed.
       say: takes notes of what cannot be written.
+      loggers: names of the others, in `SERVICES`.
 
     Raises:
       UserError: the file cannot be written when the run begins.
     """
 
-    def __init__(self, folder: RunFolder, update: int, say: Callable[[str], None]):
+    def __init__(self, folder: RunFolder, update: int, say: Callable[[str], None], loggers: Sequence[str] = ()):
         kept = [line for line in read_metrics(folder) if line["update"] <= update]
         text = "".join(map(_json_line, kept))
         replace(folder.metrics, text)
         self._path, self._say = folder.metrics, say
         self._size = len(text)  # of the whole lines in the file; in ASCII a character is a byte
         self._waiting = ""
-        self._tensorboard = TensorBoard(folder.tensorboard, kept[-1]["steps"] + 1 if kept else 0, say)
+        purge_step = kept[-1]["steps"] + 1 if kept else 0
+        self._loggers = [UntilItFails(partial(TensorBoard, folder.tensorboard, purge_step), folder.tensorboard, say)]
+        for name in dict.fromkeys(loggers):
+            begin = partial(Follower, name, folder.metrics, folder.config, folder.loggers)
+            self._loggers.append(UntilItFails(begin, name, say))
         self.seconds = kept[-1]["seconds"] if kept else 0.0
 
     def write(self, line: dict[str, Any]) -> None:
@@ -221,8 +233,9 @@ class MetricsLog:
         except OSError as error:
             if first:
                 self._say(f"note: {self._path}: cannot be written ({error.strerror}); lines wait until it can")
-        means = {name: _mean(value) for name, value in line.items() if name not in ("update", "steps")}
-        self._tensorboard.write({name: mean for name, mean in means.items() if mean is not None}, line["steps"])
+        values = values_of(line)
+        for logger in self._loggers:
+            logger.write(values, line["steps"])
 
     def flush(self) -> None:
         """Writes the lines that wait; raises OSError where the file has not got all of them."""
@@ -238,7 +251,8 @@ class MetricsLog:
         self._waiting = ""
 
     def close(self) -> None:
-        self._tensorboard.close()
+        for logger in self._loggers:
+            logger.close()
 
 
 def read_metrics(folder: RunFolder) -> list[dict[str, Any]]:
@@ -260,8 +274,3 @@ def jsonable(values: np.ndarray) -> Any:
 
 def _json_line(line: dict[str, Any]) -> str:
     return json.dumps(line, allow_nan=False) + "\n"
-
-
-def _mean(value: Any) -> float | None:
-    numbers = [x for x in (value if isinstance(value, list) else [value]) if x is not None]
-    return sum(numbers) / len(numbers) if numbers else None

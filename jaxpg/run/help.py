@@ -39,9 +39,9 @@ def train_help(arguments: Sequence[str]) -> str:
     return "\n".join(lines)
 
 
-def run_help(command: str, schema: type) -> str:
-    """Every option of a command about a run that is there."""
-    lines = [f"usage: python -m jaxpg.{command} run=DIR [option=value] ...", "", schema.__doc__]
+def command_help(command: str, what: str, schema: type) -> str:
+    """Every option of a command about `what`, such as `run=DIR`."""
+    lines = [f"usage: python -m jaxpg.{command} {what} [option=value] ...", "", schema.__doc__]
     return "\n".join(lines + [_line(field.name, field.default, field) for field in dataclasses.fields(schema)])
 
 

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import jax
 import numpy as np
 
+from jaxpg import normalization
 from jaxpg.actor_critic import deterministic_policy
 from jaxpg.run import config as configuration
 from jaxpg.run import folder
@@ -15,7 +16,7 @@ from jaxpg.run.agents import alone, described_agent
 from jaxpg.run.checkpoint import Checkpoints
 from jaxpg.run.config import Config
 from jaxpg.run.errors import UserError
-from jaxpg.run.program import make_algorithm, make_env, make_networks, state_shape
+from jaxpg.run.program import RUN_ONCE, initial_run, make_algorithm, make_env, make_networks, state_shape
 from jaxpg.run.state import Policy, current_policy
 
 
@@ -24,6 +25,7 @@ class StoredPolicy(NamedTuple):
 
     Attributes:
       act: `act(policy, obs) -> action` in [-1, 1], deterministic.
+      value: `value(policy, obs) -> V`, what the critic expects of the discounted rewards to come, in their units.
       policy: its parameters; an argument of `act`, so that all policies of a kind are one compiled program.
       env: the environment, with the changes asked for.
       config: of the agent as a run of its own, with the changes.
@@ -32,6 +34,7 @@ class StoredPolicy(NamedTuple):
     """
 
     act: Callable[[Policy, Any], Any]
+    value: Callable[[Policy, Any], Any]
     policy: Policy
     env: Any
     config: Config
@@ -53,6 +56,19 @@ def load(
     Raises:
       UserError: no run folder, no checkpoint in it, or no such agent.
     """
+    (stored,) = load_several(run, [which], agent, changes)
+    return stored
+
+
+def load_several(
+    run: str, kinds: Sequence[str], agent: int | None = None, changes: Mapping[str, Any] | None = None
+) -> list[StoredPolicy]:
+    """Policies of the same agent, which act in the same environment; arguments as in `load`.
+
+    Args:
+      run, agent, changes: as above.
+      kinds: of "best" and "last".
+    """
     run_folder = folder.find(run)
     config = configuration.change(configuration.load(run_folder.config), changes or {})
     env = make_env(config)
@@ -62,17 +78,39 @@ def load(
         agent = int(np.argmax(best.episode_return))
     if not 0 <= agent < config.num_agents:
         raise UserError(f"agent={agent}: the run has agents 0 to {config.num_agents - 1}")
-    policy: Policy = best.policy
-    if which == "last":
+    found: dict[str, tuple[Policy, int]] = {"best": (best.policy, update)}
+    if "last" in kinds:
         state, update = _restore(Checkpoints(run_folder.checkpoints, read_only=True), shape, run)
-        policy = current_policy(state.train)
-    policy = jax.tree.map(lambda x: np.asarray(x)[agent], policy)
-    networks = make_networks(config, env)
+        found["last"] = current_policy(state.train), update
+    of_agent = {
+        kind: (jax.tree.map(lambda x: np.asarray(x)[agent], policy), at) for kind, (policy, at) in found.items()
+    }
+    one = stored_policy(alone(config, agent), env, *of_agent["best"], described_agent(config, agent))
+    return [one._replace(policy=of_agent[kind][0], update=of_agent[kind][1]) for kind in kinds]
+
+
+def stored_policy(config: Config, env: Any, policy: Policy, update: int, agent: str) -> StoredPolicy:
+    """A policy that acts and values as its configuration says; arguments as the attributes of `StoredPolicy`."""
+    networks, reward_scale = make_networks(config, env), config.algo.reward_scale
 
     def act(policy, obs):
         return deterministic_policy(networks, policy.params, policy.normalizer)(obs)
 
-    return StoredPolicy(act, policy, env, alone(config, agent), described_agent(config, agent), update)
+    def value(policy, obs):
+        return networks.value(policy.params["critic"], normalization.normalize(policy.normalizer, obs)) / reward_scale
+
+    return StoredPolicy(act, value, policy, env, config, agent, update)
+
+
+def untrained(stored: StoredPolicy) -> StoredPolicy:
+    """The same agent before its first update."""
+
+    def initial(seed):
+        return current_policy(initial_run(make_algorithm(stored.config, stored.env), seed).train)
+
+    seed = np.uint32(stored.config.run.seed)
+    policy = jax.jit(initial).lower(seed).compile(RUN_ONCE)(seed)
+    return stored._replace(policy=jax.tree.map(np.asarray, policy), update=0)
 
 
 def _restore(checkpoints: Checkpoints, template: Any, run: str) -> tuple[Any, int]:

@@ -7,7 +7,7 @@ registry entry. Those made with `number` can be swept; all others are part of th
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -16,6 +16,7 @@ from envs.options import option
 from jaxpg.actor_critic import BASELINES, ESTIMATORS, RETURNS
 from jaxpg.features import FEATURES
 from jaxpg.networks import ACTIVATIONS, SIGMAS
+from jaxpg.run.loggers import SERVICES
 from jaxpg.soundness import POLICIES
 
 LARGEST = 2**31 - 1  # size of an array's axis: XLA's indices are 32-bit numbers
@@ -158,11 +159,26 @@ class Run:
     )
     checkpoint_interval: int = option(5_000_000, "environment steps between two checkpoints", at_least=1)
     run_dir: str | None = option(None, "run folder [default: runs/<env>-<algo>-s<seed>-<time>]")
+    loggers: list[str] = option([], "where metrics go besides TensorBoard", choices=tuple(SERVICES))
     cache: bool = option(True, "keep compiled programs in the user's cache folder, for the next run")
+    report: bool = option(True, "end with report.html: curves, and episodes to watch")
 
 
-GROUPS: dict[str, dict[str, type]] = {
-    "env": {name: entry.config for name, entry in envs.REGISTRY.items()},
+class Environments(Mapping[str, type]):
+    """The options of every environment by its name, of those too that are registered later."""
+
+    def __getitem__(self, name: str) -> type:
+        return envs.REGISTRY[name].config
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(envs.REGISTRY)
+
+    def __len__(self) -> int:
+        return len(envs.REGISTRY)
+
+
+GROUPS: dict[str, Mapping[str, type]] = {
+    "env": Environments(),
     "algo": {"td": TD, "ppo": PPO, "reinforce": Reinforce, "online": Online},
     "network": {"mlp": MLP, "linear": Linear},
 }
@@ -208,6 +224,42 @@ class ExportOptions:
         "best", "the best policy by the evaluations while training, or the last", choices=("best", "last")
     )
     agent: int | None = option(None, "which of several agents, from 0 [default: the best]", at_least=0)
+
+
+@dataclass(frozen=True)
+class ReportOptions:
+    """Options of the report."""
+
+    run: str | None = option(None, "run folder; required")
+    agent: int | None = option(None, "whose episodes, of several agents, from 0 [default: the best's]", at_least=0)
+    cache: bool = option(True, "keep compiled programs in the user's cache folder, for the next report")
+
+
+@dataclass(frozen=True)
+class CompareOptions:
+    """Options of the comparison."""
+
+    out: str = option("comparison.html", "the page to write")
+
+
+@dataclass(frozen=True)
+class RenderOptions:
+    """Options of the video; options of the environment may be given too, as env.NAME=VALUE."""
+
+    run: str | None = option(None, "run folder; required")
+    out: str | None = option(None, "file to write, .mp4 or .gif [default: video.mp4 in the run folder]")
+    episodes: int = option(4, "episodes side by side", at_least=1, at_most=64)
+    seed: int = option(0, "fixes the starts", at_least=0, at_most=2**32 - 1)
+    checkpoint: str = option(
+        "best",
+        "the best policy by the evaluations while training, the last, or the one before",
+        choices=("best", "last", "untrained"),
+    )
+    agent: int | None = option(None, "which of several agents, from 0 [default: the best]", at_least=0)
+    width: int = option(360, "of one episode's picture, an even number [pixels]", at_least=16)
+    height: int = option(360, "of one episode's picture, an even number [pixels]", at_least=16)
+    speed: float = option(1.0, "of the video; 1 is real time", at_least=0.01, at_most=100)
+    fps: int = option(60, "pictures a second at most; a GIF has 50", at_least=1, at_most=240)
 
 
 @dataclass(frozen=True)

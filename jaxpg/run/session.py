@@ -20,6 +20,7 @@ from jaxpg.run.config import Config
 from jaxpg.run.errors import UserError
 from jaxpg.run.folder import MetricsLog, RunFolder, jsonable
 from jaxpg.run.keeper import Keeper
+from jaxpg.run.loggers import follower
 from jaxpg.run.program import Program, Schedule, compile_program, make_env, plan
 from jaxpg.run.runtime import StopRequests, prepare
 from jaxpg.run.schema import Run
@@ -33,7 +34,7 @@ NEEDED_LATER = ("jaxpg.run.checkpoint", "tensorboardX", "matplotlib.figure", "ma
 # What may change together with resume=DIR; anything else would be another run.
 RESUMABLE = (
     *("total_steps", "log_interval", "eval_interval", "checkpoint_interval"),
-    *("stop_return", "stop_agents", "nan_policy", "cache"),
+    *("stop_return", "stop_agents", "nan_policy", "loggers", "cache", "report"),
 )
 EXPLODED = 4  # the exit status of a run that ended because its numbers were not finite any more
 NOT_SAVED = 5  # the exit status of a run whose last state is on no disk
@@ -56,6 +57,7 @@ def begin(config: Config, check: Callable[[RunFolder], None] = folder.check_empt
       check: raises UserError where the folder holds what must not be overwritten.
     """
     prepare(config)
+    follower.check(config.run.loggers)
     env = _env(config)  # before anything is written: it may have a mistake to report
     run_folder = folder.planned(config)
     lock.check_free(run_folder.path)
@@ -113,6 +115,7 @@ def _go_on(config: Config, run_folder: RunFolder) -> int:
     from jaxpg.run.checkpoint import Checkpoints
 
     recorded = folder.read_versions(run_folder)
+    follower.check(config.run.loggers)
     prepare(config, recorded.get("threads"))  # before orbax restores anything, which starts the backend as well
     checkpoints = Checkpoints(run_folder.checkpoints)
     if checkpoints.latest() is None:
@@ -191,7 +194,7 @@ def _train(session: Session, program: Program, state: RunState, compile_seconds:
     config, schedule, run_folder, display = session
     solved = False
     first = update = _update(state.train)
-    log = MetricsLog(run_folder, update, display.say)
+    log = MetricsLog(run_folder, update, display.say, config.run.loggers)
     keeper = Keeper(config, run_folder, log, display.say)
     watch, watchdog = Watch(config, display.say), Watchdog()
     began, seconds_before = time.monotonic(), log.seconds
@@ -219,13 +222,13 @@ def _train(session: Session, program: Program, state: RunState, compile_seconds:
                 keeper.save(update, state)
     finally:
         display.stop()
-        log.close()
+        training_seconds = time.monotonic() - began
+        log.close()  # which may wait for a while
     status, text = _ending(session, update, watch, keeper, solved, stop.signal)
     if text:
         display.say(text)
     if status:
         return status
-    training_seconds = time.monotonic() - began
     rate = (update - first) * schedule.steps_per_update * config.num_agents / training_seconds
     _show_results(session, rate, compile_seconds, training_seconds)
     return 0
@@ -257,6 +260,18 @@ def _show_results(session: Session, rate: float, compile_seconds: float, trainin
         display.say(results.heading(config))
         display.table(results.table(config, lines))
     display.table(_closing_rows(lines, session.run_folder, rate, compile_seconds, training_seconds))
+    if config.run.report:
+        _write_report(session)
+
+
+def _write_report(session: Session) -> None:
+    """The page of the run; a disk that is full costs no more than the page."""
+    from jaxpg.watch import report
+
+    try:
+        report.of_run(str(session.run_folder.path), None, session.config.run.cache, session.display.say)
+    except UserError as error:
+        session.display.say(f"note: no report: {error}")
 
 
 def _update(train: TrainState) -> int:

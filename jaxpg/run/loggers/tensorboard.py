@@ -1,10 +1,9 @@
-"""Metrics for TensorBoard, whose failures never stop a run."""
+"""Metrics for TensorBoard."""
 
 from __future__ import annotations
 
-import contextlib
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 
 FLUSH_INTERVAL = 10.0  # seconds; each flush waits for the disk
@@ -19,37 +18,24 @@ class TensorBoard:
     Args:
       folder: where the event file will be.
       purge_step: what TensorBoard has from an earlier part of the run at this step or later, it forgets.
-      say: takes one note, at the first failure; nothing is written after that.
+
+    Raises:
+      OSError: here and below, the file cannot be written.
     """
 
-    def __init__(self, folder: Path, purge_step: int, say: Callable[[str], None]):
-        self._folder, self._say, self._writer = folder, say, None
-        with self._until_it_fails():
-            self._writer = _writer(folder, purge_step)
+    def __init__(self, folder: Path, purge_step: int):
+        self._writer = _writer(folder, purge_step)
         self._flushed = time.monotonic()
 
     def write(self, values: Mapping[str, float], step: int) -> None:
         """Adds values at a step, counted in environment steps."""
-        if self._writer is None:
-            return
-        with self._until_it_fails():
-            self._writer.write_event(_event(values, step))
-            if time.monotonic() - self._flushed > FLUSH_INTERVAL:
-                self._writer.flush()
-                self._flushed = time.monotonic()
+        self._writer.write_event(_event(values, step))
+        if time.monotonic() - self._flushed > FLUSH_INTERVAL:
+            self._writer.flush()
+            self._flushed = time.monotonic()
 
     def close(self) -> None:
-        if self._writer is not None:
-            with self._until_it_fails():
-                self._writer.close()
-
-    @contextlib.contextmanager
-    def _until_it_fails(self) -> Iterator[None]:
-        try:
-            yield
-        except OSError as error:
-            self._writer = None
-            self._say(f"note: {self._folder}: cannot be written ({error.strerror}); no more metrics for TensorBoard")
+        self._writer.close()
 
 
 def _writer(folder: Path, purge_step: int):

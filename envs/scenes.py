@@ -1,0 +1,54 @@
+"""How the states of an environment look: for videos and reports, never for training.
+
+An environment that can be looked at has a `scene`; brax's own have a MuJoCo model too. One whose state is a point of a
+plane may have a `phase_plane`, over which a value function is drawn as a map.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax
+
+
+class Scene(NamedTuple):
+    """A MuJoCo model, and how it stands in a state.
+
+    Attributes:
+      model: `mujoco.MjModel`.
+      qpos: `qpos(State) -> [nq]`, the joint positions.
+      goal: `goal(State) -> [3]`, where the robot should get [m]; None where there is no such place.
+      goal_radius: how near is near enough [m]; None without a goal.
+    """
+
+    model: Any
+    qpos: Callable[[Any], jax.Array]
+    goal: Callable[[Any], jax.Array] | None = None
+    goal_radius: float | None = None
+
+
+class PhasePlane(NamedTuple):
+    """Two coordinates x, y that say all of a state.
+
+    Attributes:
+      labels: their names and units.
+      ranges: lower and upper end of each.
+      wraps: whether the ends of the range are the same state, of each.
+      coordinates: `coordinates(State) -> [2]`; what wraps may be out of its range.
+      observe: `observe(x, y) -> obs`.
+    """
+
+    labels: tuple[str, str]
+    ranges: tuple[tuple[float, float], tuple[float, float]]
+    wraps: tuple[bool, bool]
+    coordinates: Callable[[Any], jax.Array]
+    observe: Callable[[jax.Array, jax.Array], jax.Array]
+
+
+def scene(env: Any) -> Scene | None:
+    """How the states of `env` look; None where there is nothing to be seen, as of the quadratic problem."""
+    if hasattr(env, "scene"):
+        return env.scene
+    model = getattr(getattr(env, "sys", None), "mj_model", None)  # brax's
+    return Scene(model, lambda state: state.pipeline_state.q) if model is not None else None

@@ -1,0 +1,30 @@
+"""`python -m jaxpg.compare runs/*`: several runs side by side, as a table and as a page."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+from envs.options import build
+from jaxpg.run import config
+from jaxpg.run.commands import asks_for_help
+from jaxpg.run.errors import UserError, run_command
+from jaxpg.run.schema import CompareOptions
+
+
+def main(arguments: Sequence[str]) -> int:
+    """The comparison command; returns its exit status."""
+    if asks_for_help("compare", "DIR DIR ...", CompareOptions, arguments):
+        return 0
+    from jaxpg.watch import comparison
+
+    folders = [argument for argument in arguments if "=" not in argument or Path(argument).is_dir()]
+    options = build(CompareOptions, config.parse([argument for argument in arguments if argument not in folders]))
+    if not folders:
+        raise UserError("run folders are missing: python -m jaxpg.compare runs/a runs/b")
+    comparison.write(folders, Path(options.out), print)
+    return 0
+
+
+if __name__ == "__main__":
+    run_command(main)

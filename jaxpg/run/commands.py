@@ -1,0 +1,43 @@
+"""What the commands about finished and unfinished runs have in common."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+from envs.options import build
+from jaxpg.run import config
+from jaxpg.run.errors import UserError
+from jaxpg.run.help import command_help
+
+
+def asks_for_help(command: str, what: str, schema: type, arguments: Sequence[str]) -> bool:
+    """Whether help is asked for, which then is printed.
+
+    Args:
+      command: such as `export`.
+      what: it is about, such as `run=DIR`.
+      schema: of its options.
+      arguments: of the command line.
+    """
+    asked = bool({"--help", "-h"} & set(arguments))
+    if asked:
+        print(command_help(command, what, schema))
+    return asked
+
+
+def about_a_run(command: str, schema: type, arguments: Sequence[str]) -> Any:
+    """The options of a command about a run; None where help was asked for.
+
+    Args:
+      command, schema, arguments: as above; the options have a `run`, which must be given.
+
+    Raises:
+      OptionError, UserError: mistakes in the arguments, or no run.
+    """
+    if asks_for_help(command, "run=DIR", schema, arguments):
+        return None
+    options = build(schema, config.parse(arguments))
+    if options.run is None:
+        raise UserError("run=DIR is missing: the folder of a run, such as runs/pendulum")
+    return options

@@ -1,0 +1,93 @@
+"""The process of a logger: `python -m jaxpg.run.loggers.sender NAME METRICS CONFIG FOLDER`, started by a Follower.
+
+It reads the lines of metrics from their file, from the first one on, and sends those to the service that are newer than
+the last that it has had. So nothing is missing there after a kill, after a failure or where the service was not asked
+for from the beginning; and nothing is there twice, for a run that was resumed repeats its lines to the bit.
+(But for `seconds`, and on another machine or with other versions: of lines repeated there, the first stay.)
+"""
+
+from __future__ import annotations
+
+import fcntl
+import importlib
+import json
+import os
+import signal
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import BinaryIO
+
+from jaxpg.run.loggers import SERVICES, Service, values_of
+
+ERROR = "error: "  # begins the line that says why it failed
+LONGEST = 600  # seconds that it goes on after the training has ended
+
+
+def main(arguments: Sequence[str]) -> int:
+    """Sends lines until standard input ends; returns the exit status."""
+    name, metrics, config, folder = arguments
+    told = _only_ours(0)
+    with open(metrics, "rb") as lines, open(Path(folder, f"{name}.log"), "ab") as lock:
+        try:
+            fcntl.flock(lock, fcntl.LOCK_EX)  # the one of the training before it may still be sending
+            logger = importlib.import_module(SERVICES[name]).begin(Path(folder), _name(metrics), _read(config))
+            follow(logger, lines, told)
+            logger.close()
+        except Exception as error:  # of any kind: whatever it is, the training says it in one line
+            print(f"{ERROR}{_first_line(error)}", file=sys.stderr, flush=True)
+            return 1
+    return 0
+
+
+def follow(service: Service, lines: BinaryIO, told: int) -> None:
+    """Writes the lines that are newer than the service's last.
+
+    Args:
+      service: where they go.
+      lines: the file of metrics, which grows.
+      told: descriptor of a pipe; bytes come when there are new lines, and its end when there will be none.
+    """
+    more = True
+    while more:
+        more = bool(os.read(told, 1 << 16))
+        if not more:
+            signal.alarm(LONGEST)
+        for line in map(json.loads, _new(lines)):
+            if line["steps"] > service.last:
+                service.write(values_of(line), line["steps"])
+
+
+def _new(lines: BinaryIO) -> list[bytes]:
+    """The whole lines that have come; of a torn one the rest may come, or it will be written anew."""
+    position = lines.tell()
+    whole = lines.read().rpartition(b"\n")[0]
+    lines.seek(position + len(whole) + bool(whole))
+    return whole.splitlines()
+
+
+def _only_ours(descriptor: int) -> int:
+    """A descriptor for the same file, which libraries and their processes do not know; they find the null device."""
+    ours = os.dup(descriptor)
+    null = os.open(os.devnull, os.O_RDONLY)
+    os.dup2(null, descriptor)
+    os.close(null)
+    return ours
+
+
+def _name(metrics: str) -> str:
+    return Path(metrics).resolve().parent.name
+
+
+def _read(config: str) -> dict:
+    import yaml
+
+    return yaml.safe_load(Path(config).read_text(encoding="utf-8"))
+
+
+def _first_line(error: Exception) -> str:
+    return (str(error).splitlines() or [type(error).__name__])[0]
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))
