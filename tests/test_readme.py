@@ -1,46 +1,101 @@
-"""What the README and docs/deploy.md say can be done, done; the two set-up commands are run by `.ci/run`."""
+"""What README and docs say can be done, done; the README's two set-up commands are run by `.ci/run`."""
 
 import re
 import shlex
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
 
 ROOT = Path(__file__).parent.parent
-README, DEPLOY = ((ROOT / name).read_text(encoding="utf-8") for name in ("README.md", "docs/deploy.md"))
+PAGES = {path.name: path.read_text(encoding="utf-8") for path in [ROOT / "README.md", *(ROOT / "docs").glob("*.md")]}
+README = PAGES["README.md"]
+SAVED = {"own_environment.md": "balance.py"}  # pages whose first Python block is a file
+SIZES = ("num_envs=2", "eval_episodes=2", "env.episode_length=4", "report=false")
 
 
-def blocks(language, text=README):
-    return re.findall(rf"```{language}\n(.*?)```", text, re.DOTALL)
+def blocks(language, page):
+    return re.findall(rf"```{language}\n(.*?)```", PAGES[page], re.DOTALL)
 
 
-def test_python_examples_run():
-    assert len(blocks("python")) == 3
-    for code in blocks("python"):
-        exec(compile(code, "README.md", "exec"), {})
+def commands(page):
+    """The lines that call Python, but for those that make its environment."""
+    lines = [line for block in blocks("bash", page) for line in block.splitlines() if ".venv/bin/python " in line]
+    return [line for line in lines if not line.startswith("python3 -m venv")]
 
 
-@pytest.mark.parametrize(("text", "number"), [(README, 10), pytest.param(DEPLOY, 4, marks=pytest.mark.study)])
-def test_commands_run(command, tmp_path, text, number):
-    """Each with a few steps only; run folders below a temporary folder."""
-    blocks_of_commands = blocks("bash", text)
-    lines = [line for block in blocks_of_commands for line in block.splitlines() if "/python -m jaxpg" in line]
-    lines = [line for line in lines if not line.startswith("python3 -m venv")]
-    assert len(lines) == number
-    tiny = ["num_envs=2", "num_steps=2", "eval_episodes=2"]
-    for line in lines:
-        _, _, module, *arguments = shlex.split(line)
-        arguments = [re.sub(r"=runs/", f"={tmp_path}/", argument) for argument in arguments]
-        if "train" in module:
-            arguments = [argument for argument in arguments if not argument.startswith("total_steps=")]
-            arguments += [f"total_steps={8 if 'resume=' in line else 4}"]
-            arguments += [] if "resume=runs/" in line else tiny
-        result = command(module.removeprefix("jaxpg."), *arguments)
+def pages_with(something):
+    """As parameters; all but the README belong to the studies."""
+    return [
+        pytest.param(page, marks=[] if page == "README.md" else [pytest.mark.study])
+        for page in PAGES
+        if something(page)
+    ]
+
+
+@pytest.fixture
+def place(tmp_path, monkeypatch):
+    """`place(page)`: a folder with the files that the page speaks of, to run things in."""
+
+    def make(page):
+        monkeypatch.chdir(ROOT if page == "README.md" else tmp_path)
+        (tmp_path / "robot.xml").write_text((ROOT / "envs/assets/arm.xml").read_text())
+        if page in SAVED:
+            (tmp_path / SAVED[page]).write_text(blocks("python", page)[0])
+        return tmp_path
+
+    return make
+
+
+@pytest.mark.parametrize("page", pages_with(lambda page: blocks("python", page)))
+def test_python_examples_run(page, place):
+    folder = place(page)
+    for code in blocks("python", page)[page in SAVED :]:
+        cwd = ROOT if page == "README.md" else folder
+        result = subprocess.run([sys.executable, "-c", code], cwd=cwd, capture_output=True, text=True, check=False)
+        assert result.returncode == 0, (code, result.stderr)
+
+
+def small(arguments):
+    """The arguments of a training with a few steps only."""
+    resumed = any(argument.startswith("resume=runs/") for argument in arguments)
+    kept = [argument for argument in arguments if not argument.startswith("total_steps=")]
+    if resumed:
+        return [*kept, "total_steps=16", "report=false"]
+    rollout = [] if "algo=reinforce" in arguments else ["num_steps=2"]
+    return [*kept, *SIZES, *rollout, "total_steps=8"]
+
+
+@pytest.mark.parametrize("page", pages_with(commands))
+def test_commands_run(page, place, command_environment):
+    folder = place(page)
+    for line in commands(page):
+        _, *arguments = shlex.split(line)
+        if {"jaxpg.train", "train"} & set(arguments):
+            arguments = small(arguments)
+        result = subprocess.run(
+            [sys.executable, *arguments],
+            cwd=folder,
+            env=command_environment,
+            capture_output=True,
+            text=True,
+            check=False,
+        )
         assert result.returncode == 0, (line, result.stderr)
 
 
+def test_no_command_is_left_out():
+    """A change of the pages' form would leave the tests above with nothing to run."""
+    assert len(commands("README.md")) >= 10
+    for page in ("quick_start.md", "watching.md", "deploy.md", "own_environment.md"):
+        assert len(commands(page)) >= 3, page
+    assert len(blocks("python", "README.md")) == 3
+    assert len([line for line in blocks("python", "own_environment.md")[0].splitlines() if line]) == 40
+
+
 def test_ci_runs_the_set_up_commands():
-    setup = [line for block in blocks("bash") for line in block.splitlines() if line.startswith("python3 -m venv")]
+    setup = [line for block in blocks("bash", "README.md") for line in block.splitlines() if line.startswith("python3")]
     assert len(setup) == 2
     assert setup[0].endswith("-m jaxpg.train env=pendulum")
     assert setup[1].endswith("-m pytest")
@@ -48,6 +103,9 @@ def test_ci_runs_the_set_up_commands():
     assert "README.md" in script
 
 
-def test_named_files_exist():
-    for path in re.findall(r"(?:experiments|docs)/[\w/]+\.\w+", README + DEPLOY):
+@pytest.mark.parametrize("page", PAGES)
+def test_named_files_exist(page):
+    for path in re.findall(r"(?:experiments|docs|tests|envs)/[\w/]+\.\w+", PAGES[page]):
         assert (ROOT / path).exists(), path
+    for path in re.findall(r"\]\((?!http)([\w./]+)", PAGES[page]):
+        assert ((ROOT / page).parent if page == "README.md" else ROOT / "docs").joinpath(path).exists(), path
