@@ -228,6 +228,7 @@ def _spec(config: ArmConfig):
         spec.geom(name).fromto = [0.0, 0.0, 0.0, length, 0.0, 0.0]
     spec.body("fore").pos = [config.upper_length, 0.0, 0.0]
     spec.site("end_effector").pos = [config.fore_length, 0.0, 0.0]
+    spec.camera("top").pos = [0.0, 0.0, 3 * (config.upper_length + config.fore_length)]
     for name in ("shoulder", "elbow"):
         spec.joint(name).damping[0] = config.damping  # a polynomial in the speed: its linear coefficient
         actuator = spec.actuator(name)

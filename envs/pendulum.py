@@ -163,7 +163,7 @@ def reward(theta: jax.Array, theta_dot: jax.Array, torque: jax.Array) -> jax.Arr
 
 
 def _spec(config: PendulumConfig):
-    """The MJCF with the options written into it: inertia follows mass and length, drawing follows length."""
+    """The MJCF with the options written into it: inertia follows mass and length, pictures follow length."""
     spec = load_spec(ASSETS / "pendulum.xml")
     spec.option.timestep = config.dt
     spec.option.gravity = [0.0, 0.0, -config.gravity]
@@ -174,5 +174,6 @@ def _spec(config: PendulumConfig):
     rod.inertia = [across, across, 1e-4 * across]
     spec.geom("rod").fromto = [0.0, 0.0, 0.0, 0.0, 0.0, config.length]
     spec.site("tip").pos = [0.0, 0.0, config.length]
+    spec.camera("side").pos = [0.0, -3 * config.length, 0.0]
     spec.actuator("torque").ctrlrange = [-config.torque_limit, config.torque_limit]
     return spec

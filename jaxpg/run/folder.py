@@ -9,6 +9,7 @@ checkpoints/        the whole training state, the newest few
 best/               the best policy so far
 learning_curve.png  the curve
 report.html         the run as a page: curves, episodes to watch, options
+video.mp4           episodes as a video, where one was asked for
 lock                who is training in it, for as long as it does
 """
 

@@ -1,0 +1,128 @@
+"""Pictures one after another as a file: MP4 (H.264) by PyAV, GIF by Pillow.
+
+Both show the time as it is: MP4 at any rate of pictures; GIF, whose clock ticks in 1/100 s, with delays that differ by
+a tick where they have to, so that no error adds up.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import importlib.util
+import itertools
+import math
+import os
+from collections.abc import Callable, Iterable, Iterator
+from fractions import Fraction
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from jaxpg.run.errors import UserError
+from jaxpg.run.folder import UNFINISHED
+
+TICK = Fraction(1, 100)  # of a GIF's clock [s]
+SHORTEST = 2  # ticks of a picture: what says 1 is shown slowly by browsers
+QUALITY = "18"  # H.264's constant rate factor: 0 loses nothing, 51 is the worst
+
+
+class Format(NamedTuple):
+    """A way to keep pictures.
+
+    Attributes:
+      write: `write(path, images, seconds)`, images `[H, W, 3]` with H and W even, each shown for so long.
+      fastest: the most pictures a second.
+      package: that it needs and that is not installed with this library; None: nothing.
+    """
+
+    write: Callable[[Path, Iterable[np.ndarray], Fraction], None]
+    fastest: int
+    package: str | None
+
+
+def chosen(out: Path) -> Format:
+    """The format that the name of a file ends in.
+
+    Raises:
+      UserError: another ending, a folder of that name, or the format's package is not installed.
+    """
+    form = FORMATS.get(out.suffix.lower())
+    if form is None:
+        raise UserError(f"out={out}: must end in {' or '.join(FORMATS)}")
+    if out.is_dir():
+        raise UserError(f"out={out}: there is a folder of that name")
+    if form.package and importlib.util.find_spec(form.package) is None:
+        raise UserError(f"out={out}: {out.suffix} needs a package, pip install {form.package}; out=FILE.gif needs none")
+    return form
+
+
+def write(out: Path, images: Iterable[np.ndarray], seconds: Fraction) -> None:
+    """Writes a file in the format of its name; whoever looks sees it as it was or whole.
+
+    Args:
+      out: the file; folders above it are made.
+      images: `[H, W, 3]` each, H and W even.
+      seconds: how long each is shown.
+
+    Raises:
+      UserError: as in `chosen`, or it cannot be written.
+    """
+    form = chosen(out)
+    with _replacing(out) as unfinished:
+        form.write(unfinished, images, seconds)
+
+
+@contextlib.contextmanager
+def _replacing(path: Path) -> Iterator[Path]:
+    """A name beside it to write to, which then becomes its own."""
+    unfinished = path.with_name(path.name + UNFINISHED)
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        yield unfinished
+        with unfinished.open("rb") as file:
+            os.fsync(file.fileno())
+        unfinished.replace(path)
+    except OSError as error:
+        raise UserError(f"out={path}: cannot be written ({error.strerror or error})") from error
+    finally:
+        with contextlib.suppress(OSError):
+            unfinished.unlink(missing_ok=True)
+
+
+def _write_mp4(path: Path, images: Iterable[np.ndarray], seconds: Fraction) -> None:
+    import av
+
+    images = iter(images)
+    first = next(images)
+    with path.open("wb") as file, av.open(file, "w", format="mp4") as container:
+        stream = container.add_stream("libx264", rate=1 / seconds, options={"crf": QUALITY})
+        stream.height, stream.width = first.shape[:2]
+        stream.pix_fmt = "yuv420p"  # what every player knows; it has one colour for 2 x 2 pixels
+        for image in itertools.chain([first], images):
+            container.mux(stream.encode(av.VideoFrame.from_ndarray(np.ascontiguousarray(image), format="rgb24")))
+        container.mux(stream.encode())
+
+
+def _write_gif(path: Path, images: Iterable[np.ndarray], seconds: Fraction) -> None:
+    from PIL import Image
+
+    pictures = [Image.fromarray(image).quantize(method=Image.Quantize.FASTOCTREE) for image in images]
+    milliseconds = [10 * delay for delay in delays(len(pictures), seconds)]
+    first, *rest = pictures
+    first.save(path, format="GIF", save_all=True, append_images=rest, duration=milliseconds, loop=0)
+
+
+def delays(number: int, seconds: Fraction) -> list[int]:
+    """How long each of the pictures is shown, in ticks: picture i begins at the tick next to i * seconds.
+
+    >>> delays(6, Fraction(1, 30))
+    [3, 4, 3, 3, 4, 3]
+    """
+    begins = [math.floor(i * seconds / TICK + Fraction(1, 2)) for i in range(number + 1)]
+    return [end - begin for begin, end in itertools.pairwise(begins)]
+
+
+FORMATS = {
+    ".mp4": Format(_write_mp4, 240, "av"),
+    ".gif": Format(_write_gif, int(1 / (SHORTEST * TICK)), None),
+}
