@@ -250,6 +250,29 @@ def test_the_newest_entries_are_kept_up_to_a_size(folder, monkeypatch):
     assert [file.exists() for file in files] == [True, True, True, False, False]
 
 
+def test_entries_from_a_clock_that_was_wrong_leave_room_for_others(folder, monkeypatch):
+    """They are not the newest until the clock has caught up with them, nor kept until then."""
+    monkeypatch.setattr(cache, "MAX_BYTES", 100)
+    ahead = [make_file(folder / "jaxlib-0" / f"ahead {days}", 40, age=-days * 24 * 3600) for days in (400, 20)]
+    files = [make_file(folder / "jaxlib-0" / str(i), 40, age=60 * i) for i in range(2)]
+    cache.remove_old(folder)
+    assert [file.exists() for file in (*ahead, *files)] == [False, False, True, True]
+    ahead = [make_file(folder / "jaxlib-0" / f"ahead {days}", 1, age=-days * 24 * 3600) for days in (400, 20)]
+    cache.remove_old(folder)
+    assert [file.exists() for file in (*ahead, *files)] == [False, True, True, True]
+
+
+def test_a_clock_set_forward_takes_nothing_from_who_compiles(folder):
+    """Another process may take its temporary folder for one that a killed process left; nobody notices."""
+    said = []
+    with compilation_cache(True, said.append):
+        cache.remove_old(folder, now=time.time() + 2 * cache.MAX_STAGING_AGE)
+        assert not list(folder.glob("staging-*"))
+        jax.jit(lambda x: jnp.sin(x) * 7.0).lower(jnp.float32(0)).compile()
+    assert said == []
+    assert len(entries()) == 1
+
+
 def test_what_a_killed_process_left_is_removed_after_a_day(folder):
     """That of a process that still compiles is left alone."""
     with Store(folder).stage() as left, Store(folder).stage() as in_use:
@@ -263,7 +286,7 @@ def test_what_a_killed_process_left_is_removed_after_a_day(folder):
 
 TINY = (
     *("env=quadratic", "network=linear", "num_envs=2", "num_steps=4", "log_interval=16", "eval_interval=32"),
-    *("eval_episodes=2", "total_steps=64", "env.episode_length=8"),
+    *("eval_episodes=2", "total_steps=64", "env.episode_length=8", "report=false"),
 )
 
 

@@ -21,6 +21,7 @@ from jaxpg.vector_env import vectorize
 
 BAD = 3  # the update in which something explodes
 KEY = jax.random.key(0)
+TOLERANCE = {"rtol": 1e-5, "atol": 1e-6}
 
 
 class Envs:
@@ -105,14 +106,14 @@ def test_other_policies_are_refused():
     ],
 )
 def test_what_is_sound_is_left_alone(policy, algo):
-    """To the bit."""
+    """To rounding: they are two programs, and XLA may fuse them in different ways."""
     config = compose(["env=quadratic", f"algo={algo}", "num_envs=4", "env.episode_length=5"])
     algorithm = make_algorithm(config, make_env(config))
     (plain, _), (watched, metrics) = (
         jax.jit(lambda algorithm=algorithm: train_scan(algorithm, KEY, 5))()
         for algorithm in (algorithm, sound(algorithm, policy))
     )
-    jax.tree.map(np.testing.assert_array_equal, _numbers(plain), _numbers(watched))
+    jax.tree.map(lambda x, y: np.testing.assert_allclose(y, x, **TOLERANCE), _numbers(plain), _numbers(watched))
     assert not metrics["unsound"].any()
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import io
+import os
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -44,12 +45,23 @@ def load_spec(path: str | Path) -> mujoco.MjSpec:
     Raises:
       MujocoModelError: the file is missing or is not MJCF; MuJoCo's own message, which has the line, after the path.
     """
-    import mujoco
-
+    mujoco = import_mujoco()
     try:
         return mujoco.MjSpec.from_file(str(path))
     except (ValueError, OSError) as error:
         raise MujocoModelError(f"{path}: {' '.join(str(error).split())}") from error
+
+
+def import_mujoco():
+    """`mujoco`; raises MujocoModelError where its import fails, as it does with a MUJOCO_GL that is not to be had."""
+    try:
+        import mujoco
+    except (ImportError, RuntimeError, AttributeError) as error:  # the last where a library of OpenGL is missing
+        given = os.environ.get("MUJOCO_GL")
+        if given is None:
+            raise
+        raise MujocoModelError(f"MUJOCO_GL={given}: MuJoCo cannot be imported with it ({error}); unset it") from error
+    return mujoco
 
 
 def compile_model(spec: mujoco.MjSpec) -> mujoco.MjModel:

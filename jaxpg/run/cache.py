@@ -273,14 +273,22 @@ def check_private(folder: Path) -> None:
 def remove_old(root: Path, now: float | None = None) -> None:
     """Keeps the newest entries of all machines, up to `MAX_AGE` and `MAX_BYTES`; removes left temporary folders."""
     now, total = now or time.time(), 0
-    files = [(path, path.lstat()) for kind in ("jaxlib-*", PHYSICS) for path in root.glob(f"{kind}/*")]
-    for path, found in sorted(files, key=lambda file: file[1].st_mtime, reverse=True):
-        total += found.st_size
-        if total > MAX_BYTES or now - found.st_mtime > MAX_AGE:
+    files = [path for kind in ("jaxlib-*", PHYSICS) for path in root.glob(f"{kind}/*")]
+    for age, path in sorted((_age(path, now), path) for path in files):
+        total += path.lstat().st_size
+        if total > MAX_BYTES or age > MAX_AGE:
             path.unlink(missing_ok=True)
     for path in root.glob(f"{STAGING}*"):
-        if now - path.lstat().st_mtime > MAX_STAGING_AGE:
+        if _age(path, now) > MAX_STAGING_AGE:
             shutil.rmtree(path, ignore_errors=True)
+
+
+def _age(path: Path, now: float) -> float:
+    """How long ago it was written, in seconds; by a clock that has been set back since, how far ahead it is.
+
+    Else what was written while the clock was wrong would be the newest for years, and leave no room for the rest.
+    """
+    return abs(now - path.lstat().st_mtime)
 
 
 def _entries(folder: Path) -> list[Path]:

@@ -261,6 +261,7 @@ def _silence_what_is_left_behind() -> None:
     sys.unraisablehook = hook
     silenced = (
         ("absl", "_SignalingThread.run() raised"),
+        ("absl", "Waiting for previous save"),  # by the time of day: after a second, if the clock was set forward
         ("absl", "etadata file"),  # of a checkpoint that a kill has half removed: it is read, or named, all the same
         ("asyncio", "exception was never retrieved"),
     )

@@ -69,6 +69,6 @@ def likely_cause() -> str:
     if may_deadlock(jaxlib.__version__):
         return (
             f"jaxlib {jaxlib.__version__} can wait for ever in batched LAPACK calls, which environments of one's own "
-            "or of brax may make; PJRT_NPROC=1 avoids it, as does jaxlib 0.11.1. Where each thread is:"
+            "or of brax may make; PJRT_NPROC=1 avoids it, as does jaxlib 0.12. Where each thread is:"
         )
     return "the machine may be out of memory, or busy with other work. Where each thread is:"

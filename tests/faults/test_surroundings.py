@@ -1,5 +1,7 @@
 """Terminals, variables and folders of any kind: the same bits, or one line that says what is wrong."""
 
+import contextlib
+import json
 import os
 import signal
 import subprocess
@@ -8,7 +10,7 @@ import time
 from pathlib import Path
 
 import pytest
-from processes import RUN, outcome, training
+from processes import LINES, RUN, has_written, outcome, training
 
 from jaxpg.run.checkpoint import Checkpoints
 
@@ -95,6 +97,50 @@ def test_one_core_with_the_same_threads(command_environment, undisturbed, tmp_pa
     assert outcome(folder) == undisturbed[0]
 
 
+# --- the clock --------------------------------------------------------------------------------------------------------
+
+# The system's clock is set at each look at it, by the next of so many seconds, before anything else has seen it.
+SET_CLOCK = """
+import itertools, runpy, sys, time
+offsets = itertools.cycle([int(seconds) for seconds in sys.argv.pop(1).split(",")])
+for name, unit in (("time", 1), ("time_ns", 10**9)):
+    look = getattr(time, name)
+    setattr(time, name, lambda look=look, unit=unit: look() + unit * next(offsets))
+runpy.run_module("jaxpg.train", run_name="__main__", alter_sys=True)
+"""
+
+
+@contextlib.contextmanager
+def training_while_the_clock_is_set(offsets, environment, *arguments):
+    command = [sys.executable, "-c", SET_CLOCK, ",".join(map(str, offsets)), *arguments]
+    with subprocess.Popen(command, env=environment, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE) as process:
+        try:
+            yield process
+        finally:
+            process.kill()
+
+
+def test_a_clock_that_is_set_back_and_forth(undisturbed, command_environment, tmp_path):
+    """While it trains, and by a year more between a kill and the resumption: nothing follows from the time of day.
+
+    Forward by less than a day: then the other tests' temporary folders, in the cache, would be taken for left ones.
+    """
+    folder, hour, day = tmp_path / "run", 3600, 86400
+    with training_while_the_clock_is_set([0, -day, 20 * hour], command_environment, *RUN, f"run_dir={folder}") as first:
+        assert has_written(first, folder, LINES // 2)
+        first.kill()
+        assert first.stderr.read() == b""
+    offsets = [-365 * day, -366 * day, -400 * day]
+    with training_while_the_clock_is_set(offsets, command_environment, f"resume={folder}") as second:
+        assert second.stderr.read() == b""
+        assert second.wait() == 0
+    assert outcome(folder) == undisturbed[0]
+    lines = [json.loads(line) for line in (folder / "metrics.jsonl").read_text().splitlines()]
+    seconds = [line["seconds"] for line in lines]
+    assert seconds == sorted(seconds)
+    assert 0 < seconds[0] <= seconds[-1] < hour
+
+
 # --- output -----------------------------------------------------------------------------------------------------------
 
 
@@ -146,6 +192,18 @@ def test_variables_that_are_refused(name, command_environment, tmp_path):
     result = subprocess.run(command, env=command_environment | variables, capture_output=True, text=True, check=False)
     assert result.returncode == 2, result.stderr
     assert result.stderr.startswith(f"error: {message}"), result.stderr
+    assert len(result.stderr.splitlines()) == 1
+    assert not (tmp_path / "run").exists()
+
+
+@pytest.mark.faults
+def test_a_renderer_that_is_not_to_be_had(command_environment, tmp_path):
+    """Of which MuJoCo's import speaks, although nothing is drawn."""
+    command = [*TRAIN, "env=pendulum", f"run_dir={tmp_path / 'run'}"]
+    environment = command_environment | {"MUJOCO_GL": "nonsense"}
+    result = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
+    assert result.returncode == 2
+    assert result.stderr.startswith("error: MUJOCO_GL=nonsense: MuJoCo cannot be imported with it")
     assert len(result.stderr.splitlines()) == 1
     assert not (tmp_path / "run").exists()
 
