@@ -12,7 +12,7 @@ ROOT = Path(__file__).parent.parent
 PAGES = {path.name: path.read_text(encoding="utf-8") for path in [ROOT / "README.md", *(ROOT / "docs").glob("*.md")]}
 README = PAGES["README.md"]
 SAVED = {"own_environment.md": "balance.py"}  # pages whose first Python block is a file
-SIZES = ("num_envs=2", "eval_episodes=2", "env.episode_length=4", "report=false")
+SIZES = ("num_envs=2", "eval_episodes=2", "report=false")
 
 
 def blocks(language, page):

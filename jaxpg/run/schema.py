@@ -260,6 +260,7 @@ class RenderOptions:
     height: int = option(360, "of one episode's picture, an even number [pixels]", at_least=16)
     speed: float = option(1.0, "of the video; 1 is real time", at_least=0.01, at_most=100)
     fps: int = option(60, "pictures a second at most; a GIF has 50", at_least=1, at_most=240)
+    cache: bool = option(True, "keep the compiled program in the user's cache folder, for the next video")
 
 
 @dataclass(frozen=True)
