@@ -11,7 +11,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple
 
-from envs import arm, brax_env, pendulum, quadratic
+from envs import arm, brax_env, pendulum, playground_env, quadratic
 from envs.options import OptionError, build, unknown
 
 
@@ -36,7 +36,19 @@ REGISTRY: dict[str, Entry] = {
     "arm": Entry(arm.ArmConfig, arm.Arm, arm.TRAINING),
     "quadratic": Entry(quadratic.QuadraticConfig, quadratic.make, quadratic.TRAINING),
     "brax": Entry(brax_env.BraxConfig, brax_env.make, brax_env.TRAINING),
+    "playground": Entry(playground_env.PlaygroundConfig, playground_env.make, playground_env.TRAINING),
 }
+
+
+def register(name: str, entry: Entry) -> None:
+    """Adds an environment of one's own: it can be made, trained and looked at as the others, by its name.
+
+    Raises:
+      ValueError: there is one of that name already.
+    """
+    if name in REGISTRY:
+        raise ValueError(f"there is an environment called '{name}' already")
+    REGISTRY[name] = entry
 
 
 def make(name: str, /, **overrides: Any) -> Any:

@@ -1,0 +1,118 @@
+"""MuJoCo Playground's environments, by their names: `make("playground", name="CartpoleBalance")`.
+
+They are stepped by `mjx.step` in JAX, as Playground has them, and are as fast as that is on a CPU. Where Playground
+observes several things by name, such as what only a critic may see, it is the entry "state" that is observed here.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import importlib.util
+import io
+import subprocess
+import warnings
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import jax
+
+from envs.base import State
+from envs.options import OptionError, option, unknown
+from envs.scenes import Scene
+
+# Steps are slow: a checkpoint is due after fewer of them.
+_SLOW = {"total_steps": 2_000_000, "eval_episodes": 16, "checkpoint_interval": 500_000}
+TRAINING = {
+    "ppo": {  # of a handful tried on CartpoleBalance, where TD(lambda) with its defaults learns little
+        **_SLOW,
+        "num_envs": 128,
+        "num_steps": 32,
+        "algo.epochs": 4,
+        "algo.minibatches": 8,
+        "algo.actor_lr": 0.0005,
+        "algo.gamma": 0.995,
+        "algo.reward_scale": 0.1,
+    },
+    "td": {**_SLOW, "num_envs": 64},
+    "reinforce": {**_SLOW, "num_envs": 16},
+}
+
+
+@dataclass(frozen=True)
+class PlaygroundConfig:
+    """Options of a Playground environment."""
+
+    name: str = option("CartpoleBalance", "Playground's name of the environment")
+    episode_length: int = option(1000, "steps until the time limit", at_least=1)
+
+
+class Playground:
+    """An environment of Playground's interface with brax's: `State.data` is carried within `State.pipeline_state`.
+
+    Args:
+      env: with Playground's `reset(key) -> State` and `step(State, action) -> State`.
+    """
+
+    def __init__(self, env: Any):
+        self.env, self.action_size = env, env.action_size
+
+    @property
+    def observation_size(self) -> int:
+        return jax.eval_shape(self.reset, jax.random.key(0)).obs.shape[-1]
+
+    @property
+    def backend(self) -> str:
+        return "mjx"
+
+    @property
+    def unwrapped(self) -> Any:
+        return self.env
+
+    @property
+    def dt(self) -> float:
+        return self.env.dt
+
+    @property
+    def scene(self) -> Scene:
+        return Scene(self.env.mj_model, lambda state: state.pipeline_state.data.qpos)
+
+    def reset(self, rng: jax.Array) -> State:
+        """Playground's own start; it is given the key as two plain numbers, since it keeps keys in its states."""
+        return adapted(self.env.reset(jax.random.key_data(rng)))
+
+    def step(self, state: State, action: jax.Array) -> State:
+        """Playground's own step."""
+        return adapted(self.env.step(state.pipeline_state, action))
+
+
+def adapted(state: Any) -> State:
+    """Playground's state, whole, within brax's, with an array as observation."""
+    obs = state.obs["state"] if isinstance(state.obs, Mapping) else state.obs
+    return State(state, obs, state.reward, state.done, state.metrics)
+
+
+def make(config: PlaygroundConfig) -> Playground:
+    """The environment of that name.
+
+    Raises:
+      OptionError: Playground is not installed, or has none of that name (with the nearest one), or cannot make it: its
+        robots are MuJoCo Menagerie's, which it downloads when the first is asked for, and a few of its environments are
+        behind the present MuJoCo.
+    """
+    if importlib.util.find_spec("mujoco_playground") is None:
+        raise OptionError(["env=playground needs MuJoCo Playground: pip install playground"])
+    # What its dependencies say as they are imported helps nobody here.
+    with warnings.catch_warnings(), contextlib.redirect_stdout(io.StringIO()):
+        warnings.simplefilter("ignore")
+        from mujoco_playground import registry
+
+        if config.name not in registry.ALL_ENVS:
+            raise OptionError([unknown("Playground environment", config.name, registry.ALL_ENVS)])
+        try:
+            return Playground(registry.load(config.name, config_overrides={"impl": "jax"}))
+        except (OSError, subprocess.SubprocessError) as error:
+            reason = f"its robot is of MuJoCo Menagerie, which Playground could not download ({error})"
+        except AttributeError as error:
+            reason = f"Playground and this release of MuJoCo do not go together ({error})"
+    raise OptionError([f"env.name={config.name}: {reason}"])
