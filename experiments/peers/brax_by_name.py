@@ -1,4 +1,4 @@
-"""brax's PPO on brax's reacher (spring physics) or Playground's CartpoleBalance: `env=NAME steps=... seed=... out=FILE`.
+"""brax's PPO on brax's reacher (spring) or on Playground's CartpoleBalance: `env=NAME steps=... seed=... out=FILE`.
 
 The settings are those that brax's training notebook and Playground publish, but for smaller networks, an eighth of the
 environments and smaller batches: theirs are for GPUs, and make a handful of updates in a few million steps. `out` is a
