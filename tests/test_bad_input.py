@@ -96,6 +96,7 @@ MISTAKES = {
         ["num_envs=1", "num_steps=1", "total_steps=1e12"],
         "total_steps=1000000000000: with 1 steps an update it must stay below 2147483647",
     ),
+    "episodes beyond 32 bits": (["env.episode_length=3e9"], "env.episode_length=3000000000: it must stay below 2**31"),
     "rollouts beyond memory": (["num_envs=50000000"], "num_envs=50000000: such a training needs "),
     "networks beyond memory": (
         ["network.widths=[1000000,1000000]"],

@@ -54,6 +54,24 @@ def test_other_versions_are_named(runs, command, tmp_path):
     assert "jax was 0.0.1 and is " in command("inspect", f"run={tmp_path / 'run'}").stdout
 
 
+def test_versions_that_computed_a_part_of_a_run_stay_on_record(runs, command, tmp_path):
+    """After it has gone on with others, and so the way back to the first ones is noted, too."""
+    folder = tmp_path / "run"
+    shutil.copytree(runs / "run", folder)
+    path = folder / "versions.json"
+    now = json.loads(path.read_text())
+    path.write_text(json.dumps(now | {"jax": "0.0.1"}))
+    result = command("train", f"resume={folder}", "total_steps=128")
+    assert f"note: jax was 0.0.1 and is {now['jax']}: the same run, but not the same bits" in result.stdout
+    assert json.loads(path.read_text()) == now | {"earlier": [now | {"jax": "0.0.1"}]}
+    assert "as they are now; 1 others before (versions.json)" in command("inspect", f"run={folder}").stdout
+    result = command("train", f"resume={folder}", "total_steps=160")
+    assert "not the same bits" not in result.stdout
+    path.write_text(json.dumps(json.loads(path.read_text()) | {"jax": "0.0.2"}))
+    assert "jax was 0.0.2" in command("train", f"resume={folder}", "total_steps=192").stdout
+    assert [part["jax"] for part in json.loads(path.read_text())["earlier"]] == ["0.0.1", "0.0.2"]
+
+
 def test_a_damaged_checkpoint_is_named_and_the_one_before_it_used(runs, command, tmp_path):
     """The run goes on from there and ends with the bits of the one that was not damaged."""
     folder = tmp_path / "run"

@@ -3,6 +3,7 @@
 import json
 import os
 import signal
+import struct
 import subprocess
 import sys
 import time
@@ -97,6 +98,32 @@ def log_lines(run_folder, updates, say=print, done=0, loggers=("wandb",)):
     for update in updates:
         log.write(line_at(update))
     log.close()
+
+
+def steps_in_tensorboard(folder):
+    """What TensorBoard shows: it reads files by the order of their names; a beginning purges what is later."""
+    from tensorboardX.proto.event_pb2 import Event
+
+    steps = []
+    for path in sorted(folder.iterdir()):
+        content = path.read_bytes()
+        while content:
+            (length,) = struct.unpack("Q", content[:8])
+            event, content = Event.FromString(content[12 : 12 + length]), content[16 + length :]
+            if event.HasField("session_log"):
+                steps = [step for step in steps if step < event.step]
+            if event.HasField("summary"):
+                steps.append(event.step)
+    return steps
+
+
+@pytest.mark.parametrize("now", [3e9, 2e9, 1e9], ids=["later", "in the same second", "set back"])
+def test_tensorboard_has_every_step_once_whatever_the_clock_says(run_folder, monkeypatch, now):
+    monkeypatch.setattr(time, "time", lambda: 2e9)
+    log_lines(run_folder, range(1, 6), loggers=())
+    monkeypatch.setattr(time, "time", lambda: now)
+    log_lines(run_folder, range(4, 8), done=3, loggers=())
+    assert steps_in_tensorboard(run_folder.tensorboard) == [8 * update for update in range(1, 8)]
 
 
 def test_values_are_means_over_the_agents_that_have_one():

@@ -96,7 +96,7 @@ def _complete(config: Config) -> Config:
     problems = [*_conflicts_of_the_algorithm(config), *_conflicts_of_the_network(config), *_conflicts_of_agents(config)]
     default = config.env.episode_length if config.choices["algo"] == "reinforce" else DEFAULT_ROLLOUT
     config = dataclasses.replace(config, run=dataclasses.replace(config.run, num_steps=config.run.num_steps or default))
-    problems += _conflicts_of_sizes(config.run)
+    problems += _conflicts_of_sizes(config.run, config.env.episode_length)
     if problems:
         raise OptionError(problems)
     return config
@@ -145,8 +145,10 @@ def _conflicts_of_agents(config: Config) -> Iterator[str]:
         yield f"seed={run.seed} num_seeds={run.num_seeds}: seeds must stay below 2**32"
 
 
-def _conflicts_of_sizes(run: Run) -> Iterator[str]:
-    """XLA's indices and the counter of updates are 32-bit numbers."""
+def _conflicts_of_sizes(run: Run, horizon: int) -> Iterator[str]:
+    """XLA's indices and the counters of steps and updates are 32-bit numbers."""
+    if horizon >= 2**31:
+        yield f"env.episode_length={horizon}: it must stay below 2**31"
     rollout = run.num_envs * run.num_steps
     if rollout >= 2**31:
         yield f"num_envs={run.num_envs} num_steps={run.num_steps}: their product must stay below 2**31"

@@ -178,6 +178,12 @@ def write_versions(folder: RunFolder) -> None:
     replace(folder.versions, json.dumps(versions(), indent=1))
 
 
+def change_versions(folder: RunFolder, recorded: dict[str, Any], now: dict[str, Any]) -> None:
+    """Records what goes on with a run; what computed it before stays in `versions.json` too, as `earlier`."""
+    before = {name: value for name, value in recorded.items() if name != "earlier"}
+    replace(folder.versions, json.dumps({**now, "earlier": [*recorded.get("earlier", []), before]}, indent=1))
+
+
 def read_versions(folder: RunFolder) -> dict[str, Any]:
     """What computed the run; raises UserError if the file cannot be read, or is not as `write_versions` left it."""
     try:

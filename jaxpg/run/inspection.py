@@ -29,7 +29,8 @@ class Inspection(NamedTuple):
       digest: of the state in the newest sound checkpoint; two runs are at the same point, bit for bit, where it is the
         same. None where there is none.
       lines: of metrics.
-      changed: name -> (what it was when the run began, what it is now), of versions and machine.
+      changed: name -> (what it was when the run last went on, what it is now), of versions and machine.
+      earlier: versions and machines that have computed parts of the run before those.
     """
 
     run_folder: RunFolder
@@ -42,6 +43,7 @@ class Inspection(NamedTuple):
     digest: str | None
     lines: list[dict[str, Any]]
     changed: dict[str, tuple[Any, Any]]
+    earlier: int
 
 
 def inspect(path: str) -> Inspection:
@@ -70,6 +72,7 @@ def inspect(path: str) -> Inspection:
         digest=stored.digest(update) if sound else None,
         lines=lines,
         changed={name: (before.get(name), value) for name, value in now.items() if before.get(name) != value},
+        earlier=len(before.get("earlier", [])),
     )
 
 
@@ -117,6 +120,8 @@ def described(found: Inspection) -> str:
     rows["versions"] = "as they are now"
     if found.changed:
         rows["versions"] = ", ".join(f"{name} was {was} and is {now}" for name, (was, now) in found.changed.items())
+    if found.earlier:
+        rows["versions"] += f"; {found.earlier} others before (versions.json)"
     rows["digest"] = found.digest or "none"
     problems = [f"damaged: {problem}" for problem in found.checkpoints.values() if problem]
     return "\n".join([f"{name:<12} {value}" for name, value in rows.items()] + problems)

@@ -138,12 +138,15 @@ def _go_on(config: Config, run_folder: RunFolder) -> int:
     display.say(
         f"resuming {run_folder.path} at {update * schedule.steps_per_update:,} of {schedule.total_steps:,} steps"
     )
-    for name, now in folder.versions().items():
-        if recorded.get(name) != now:
-            display.say(f"note: {name} was {recorded.get(name)} and is {now}: the same run, but not the same bits")
+    now = folder.versions()
+    changed = [name for name in now if recorded.get(name) != now[name]]
+    for name in changed:
+        display.say(f"note: {name} was {recorded.get(name)} and is {now[name]}: the same run, but not the same bits")
     program, seconds = _compile(session, _env(config), resumed=True)
     state = checkpoints.restore(update, program.state_shape)
     folder.replace(run_folder.config, configuration.to_yaml(config))
+    if changed:
+        folder.change_versions(run_folder, recorded, now)
     return _train(session, program, state, seconds)
 
 

@@ -68,7 +68,7 @@ def report(run_folder: RunFolder, config: Config, stages: Mapping[str, StoredPol
         "tables": _settings(config, lines),
         "improvement": None,
         "configuration": options(config),
-        "versions": [[name, str(value)] for name, value in folder.read_versions(run_folder).items()],
+        "versions": _versions(run_folder),
     }
     return finite(data | episodes(stages, recordings))
 
@@ -98,6 +98,13 @@ def _returns(stages: Mapping[str, StoredPolicy], recordings: Sequence[Recording]
         error = returns.std(ddof=1) / math.sqrt(len(returns)) if len(returns) > 1 else math.nan
         rows.append([f"return, {label}", f"{returns.mean():.1f} ± {error:.1f} over {len(returns)} episodes"])
     return rows
+
+
+def _versions(run_folder: RunFolder) -> list[list[str]]:
+    """What computes the run now; where others have computed parts of it, what they were, too."""
+    recorded = folder.read_versions(run_folder)
+    all_parts = [*recorded.pop("earlier", []), recorded]
+    return [[name, ", then ".join(dict.fromkeys(str(part.get(name)) for part in all_parts))] for name in recorded]
 
 
 def _settings(config: Config, lines: Sequence[Json]) -> list[Json]:

@@ -20,12 +20,13 @@ from jaxpg.run.errors import run_command
 from jaxpg.run.schema import GROUPS, Run
 
 BASE = {"env": "quadratic", "num_envs": 2, "total_steps": 32, "eval_episodes": 2, "env.episode_length": 4}
+BASE |= {"report": "false"}  # which takes longer than such a run
 # Where what a run writes goes is not up to chance; and the sizes that cost time are small or impossible.
-FIXED = ("run_dir", "seed", "cache", "num_seeds", "vmap_seeds", "eval_episodes", "total_steps")
+FIXED = ("run_dir", "loggers", "report", "seed", "cache", "num_seeds", "vmap_seeds", "eval_episodes", "total_steps")
 WRONG = st.sampled_from(
     ["nan", "inf", "-1", "0", "true", "null", "many", "[1]", "[]", "1e400", "-0.5", "99999999999999"]
 )
-FEW, MANY = 1, 20  # rounds of 50 examples
+FEW, MANY = 1, 21  # rounds of 50 examples, but for the first
 
 
 def value_of(hint, metadata):

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
 import time
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 
 FLUSH_INTERVAL = 10.0  # seconds; each flush waits for the disk
@@ -24,30 +25,50 @@ class TensorBoard:
     """
 
     def __init__(self, folder: Path, purge_step: int):
-        self._writer = _writer(folder, purge_step)
+        from tensorboardX.proto.event_pb2 import Event, SessionLog
+        from tensorboardX.record_writer import RecordWriter
+
+        folder.mkdir(exist_ok=True)
+        self._file = RecordWriter(str(_after_the_others(folder)))
+        with self._closed_at_a_failure():
+            self._file.write(Event(wall_time=time.time(), file_version="brain.Event:2").SerializeToString())
+            start = SessionLog(status=SessionLog.START)
+            self._file.write(Event(step=purge_step, wall_time=time.time(), session_log=start).SerializeToString())
+            self._file.flush()
         self._flushed = time.monotonic()
 
     def write(self, values: Mapping[str, float], step: int) -> None:
         """Adds values at a step, counted in environment steps."""
-        self._writer.write_event(_event(values, step))
-        if time.monotonic() - self._flushed > FLUSH_INTERVAL:
-            self._writer.flush()
-            self._flushed = time.monotonic()
+        with self._closed_at_a_failure():
+            self._file.write(_event(values, step).SerializeToString())
+            if time.monotonic() - self._flushed > FLUSH_INTERVAL:
+                self._file.flush()
+                self._flushed = time.monotonic()
 
     def close(self) -> None:
-        self._writer.close()
+        with self._closed_at_a_failure():
+            self._file.flush()
+            self._file.close()
+
+    @contextlib.contextmanager
+    def _closed_at_a_failure(self) -> Iterator[None]:
+        """Else Python tries to write the rest when it forgets the file, and from 3.13 on prints a traceback."""
+        try:
+            yield
+        except OSError:
+            with contextlib.suppress(OSError):
+                self._file.close()
+            raise
 
 
-def _writer(folder: Path, purge_step: int):
-    from tensorboardX.event_file_writer import EventsWriter
-    from tensorboardX.proto.event_pb2 import Event, SessionLog
+def _after_the_others(folder: Path) -> Path:
+    """Where the next event file goes: TensorBoard reads them in the order of their names.
 
-    folder.mkdir(exist_ok=True)
-    writer = EventsWriter(str(folder / "events"))
-    start = SessionLog(status=SessionLog.START)
-    writer.write_event(Event(step=purge_step, wall_time=time.time(), session_log=start))
-    writer.flush()
-    return writer
+    By tensorboardX's own names, which begin with the time of day, a part of the run would come before an earlier one
+    if the clock was set back between them, and then be forgotten.
+    """
+    numbers = [int(path.name[7:13]) for path in folder.glob("events_[0-9][0-9][0-9][0-9][0-9][0-9].*")]
+    return folder / f"events_{max(numbers, default=0) + 1:06d}.out.tfevents"
 
 
 def _event(values: Mapping[str, float], step: int):
