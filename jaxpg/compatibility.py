@@ -10,7 +10,7 @@ import re
 WRONG_SUMS = ("0.10.2", "0.11.0", "0.11.1", "0.11.2")
 # Releases that wait for ever when batched LAPACK calls fill XLA's thread pool; the last one is 0.11.0. With 0.10.1
 # sixty steps of 1,024 half cheetahs in MJX do not end on two cores, with 0.12.0.1 they do. The shipped environments
-# make no such calls; brax's do.
+# make no such calls; brax's and Playground's do.
 LAST_DEADLOCK = (0, 11, 0)
 
 

@@ -34,7 +34,7 @@ def main(arguments: Sequence[str]) -> int:
     mean, stderr = returns.mean(), returns.std(ddof=1) / math.sqrt(len(returns))
     saved = f"{options.checkpoint} policy (saved after {stored.update:,} updates)"
     how = options.backend if options.policy == "jax" else f"{options.backend}, as {options.policy}"
-    print(f"{stored.config.choices['env']}, {stored.agent}, {saved}, {how}")
+    print(f"{stored.config.task}, {stored.agent}, {saved}, {how}")
     print(f"return   {mean:.2f} +- {stderr:.2f} (mean and standard error, {len(returns)} episodes)")
     for metric, values in metrics.items():
         print(

@@ -96,6 +96,7 @@ def test_success_is_shown_where_there_is_one(run):
     ("runs", "message"),
     [
         ([("a", "env=arm"), ("b", "env=pendulum")], "runs of arm and pendulum: only returns of the same environment"),
+        ([("a", "env=brax"), ("b", "env=brax", "env.name=ant")], "runs of ant and inverted_pendulum: only returns"),
         ([("a", "seed=1"), ("b", "seed=1")], "seed 1 is there twice"),
         ([("a", "seed=1"), ("none", "seed=2")], "no evaluation that all its runs have made"),
     ],

@@ -95,7 +95,7 @@ def controller(stored: StoredPolicy, origin: dict[str, str]) -> Controller:
     dense = stored.policy.params["actor"]["params"]["MLP_0"]
     layers = [dense[f"Dense_{i}"] for i in range(len(dense))]
     return Controller(
-        name=re.sub(r"\W", "_", config.env.name if config.choices["env"] == "brax" else config.choices["env"]),
+        name=re.sub(r"\W", "_", config.task),
         interface=interface(stored.env),
         mean=np.asarray(stored.policy.normalizer.mean),
         scale=np.asarray(normalization.inverse_deviation(stored.policy.normalizer)),

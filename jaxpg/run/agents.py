@@ -75,4 +75,4 @@ def described(config: Config) -> str:
     run, number = config.run, len(settings(config.sweep))
     seeds = f"seeds {run.seed} to {run.seed + run.num_seeds - 1}" if run.num_seeds > 1 else f"seed {run.seed}"
     agents = f"{number} settings x {seeds}" if config.sweep else seeds
-    return f"{config.choices['algo']} on {config.choices['env']}, {agents}"
+    return f"{config.choices['algo']} on {config.task}, {agents}"

@@ -293,7 +293,15 @@ def _storage(leaf: Any) -> jax.ShapeDtypeStruct:
 
 def _from_storage(array: Any, leaf: Any) -> jax.Array:
     array = jax.device_put(array)  # jax.numpy.asarray would compile a program for it
-    return jax.random.wrap_key_data(array, impl=jax.random.key_impl(leaf)) if is_key(leaf) else array
+    return jax.random.wrap_key_data(array, impl=_key_impl(leaf)) if is_key(leaf) else array
+
+
+def _key_impl(leaf: Any) -> str:
+    """Whose random keys these are; of shapes and types, which `jax.random.key_impl` does not take, as well."""
+    names = ("threefry2x32", "rbg", "unsafe_rbg")
+    return next(
+        name for name in names if jax.eval_shape(functools.partial(jax.random.key, 0, impl=name)).dtype == leaf.dtype
+    )
 
 
 def _describe(leaf: np.ndarray) -> list[Any]:

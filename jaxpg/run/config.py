@@ -45,6 +45,11 @@ class Config:
     sweep: Mapping[str, list[float]] = field(default_factory=dict)
 
     @property
+    def task(self) -> str:
+        """The environment's name; of another library's, the name that it has there."""
+        return getattr(self.env, "name", self.choices["env"])
+
+    @property
     def num_shards(self) -> int:
         """Parts of each agent's environments; algorithms that do not divide them have one."""
         return getattr(self.algo, "num_shards", 1)

@@ -67,9 +67,8 @@ def planned(config: Config) -> RunFolder:
     if run.run_dir is not None:
         folder = RunFolder(run.run_dir)
     else:
-        name = config.env.name if config.choices["env"] == "brax" else config.choices["env"]
         stamp = time.strftime("%Y%m%d-%H%M%S")
-        folder = RunFolder(Path("runs") / f"{name}-{config.choices['algo']}-s{run.seed}-{stamp}")
+        folder = RunFolder(Path("runs") / f"{config.task}-{config.choices['algo']}-s{run.seed}-{stamp}")
     if set("[]") & set(str(folder.path.resolve())):
         raise UserError(f"{folder.path}: checkpoints cannot be kept below a folder with [ or ] in its name")
     return folder

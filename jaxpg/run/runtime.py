@@ -17,19 +17,21 @@ from jaxpg.run.config import Config
 from jaxpg.run.errors import UserError
 from jaxpg.run.folder import num_threads
 
+MAY_CALL_LAPACK = ("brax", "playground")
+
 
 def prepare(config: Config, threads: int | None = None) -> None:
     """Starts the backend, with the number of XLA's threads pinned, on which the bits of large reductions depend.
 
     Args:
-      config: brax's environments make LAPACK calls, which need a single thread on some jaxlib releases.
+      config: environments of other libraries make LAPACK calls, which need a single thread on some jaxlib releases.
       threads: those of the run that is resumed; by default as many as there are cores.
 
     Raises:
       UserError: the process's environment asks JAX for something that cannot be trained with.
     """
     _check_variables()
-    if threads is None and config.choices["env"] == "brax" and may_deadlock(jaxlib.__version__):
+    if threads is None and config.choices["env"] in MAY_CALL_LAPACK and may_deadlock(jaxlib.__version__):
         threads = 1
     os.environ["PJRT_NPROC"] = str(threads or num_threads())
     with contextlib.suppress(RuntimeError):  # where the process has computed something already, with what it has

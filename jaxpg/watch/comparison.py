@@ -88,7 +88,7 @@ def methods(paths: Sequence[str]) -> list[Method]:
       UserError: no run folder, runs of different environments, a run twice, or one that has not been evaluated.
     """
     agents = [agent for path in paths for agent in _agents(path)]
-    tasks = sorted({agent.options["env"] for agent in agents})
+    tasks = sorted({_task(agent) for agent in agents})
     if len(tasks) > 1:
         raise UserError(f"runs of {' and '.join(tasks)}: only returns of the same environment can be compared")
     groups: dict[str, list[Agent]] = {}
@@ -99,6 +99,10 @@ def methods(paths: Sequence[str]) -> list[Method]:
     for method in found:
         _check(method)
     return sorted(found, key=lambda method: -float(interquartile_mean(method.scores)))
+
+
+def _task(agent: Agent) -> str:
+    return agent.options.get("env.name", agent.options["env"])
 
 
 def _agents(path: str) -> Iterator[Agent]:
@@ -153,12 +157,10 @@ def _check(method: Method) -> None:
 def comparison(found: Sequence[Method]) -> Json:
     """What the page shows of some methods, as plain values."""
     shown = found[:MOST]
-    options, rows = found[0].agents[0].options, table(found)
+    task, rows = _task(found[0].agents[0]), table(found)
     data = {
         "kind": "comparison",
-        "title": f"{len(found)} methods on {options['env']}"
-        if len(found) > 1
-        else f"{found[0].label} on {options['env']}",
+        "title": f"{len(found)} methods on {task}" if len(found) > 1 else f"{found[0].label} on {task}",
         "facts": [["score", "return of the last evaluation that all seeds of a method have"]],
         "curves": [panel for panel in (_panel(shown, *metric) for metric in PANELS.items()) if panel["series"]],
         "tables": [{"title": "methods, the best first", "columns": COLUMNS[: len(rows[0])], "rows": rows}],
