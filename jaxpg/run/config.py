@@ -357,6 +357,11 @@ def change(config: Config, changes: Mapping[str, Any]) -> Config:
     return from_dict(values, problems)
 
 
+def named(config: Config) -> dict[str, Any]:
+    """Everything that the command line can say, by its name there: the groups' members, and all options."""
+    return {**config.choices, **flatten(config)}
+
+
 def flatten(config: Config) -> dict[str, Any]:
     """The values of all options, and of the sweep, by their names on the command line."""
     values = config.to_dict()

@@ -107,7 +107,7 @@ def begin_or_resume(config: Config) -> int:
         stored = configuration.load(run_folder.config)
         # The folder may have been moved, or be given in other words.
         config = dataclasses.replace(config, run=dataclasses.replace(config.run, run_dir=stored.run.run_dir))
-        _check_same_run(run_folder, stored, config, _named(stored) | _named(config))
+        _check_same_run(run_folder, stored, config, configuration.named(stored) | configuration.named(config))
         return _go_on(config, run_folder)
 
 
@@ -150,14 +150,9 @@ def _go_on(config: Config, run_folder: RunFolder) -> int:
     return _train(session, program, state, seconds)
 
 
-def _named(config: Config) -> dict[str, Any]:
-    """Everything that the command line can say, by its name there."""
-    return {**config.choices, **configuration.flatten(config)}
-
-
 def _check_same_run(run_folder: RunFolder, stored: Config, config: Config, names: Iterable[str]) -> None:
     """Raises UserError where one of these options has changed that would make it another run."""
-    before, after = _named(stored), _named(config)
+    before, after = configuration.named(stored), configuration.named(config)
     for name in names:
         if name not in RESUMABLE and before.get(name) != after.get(name):
             given, has = (f"{name}={values[name]}" if name in values else f"no {name}" for values in (after, before))

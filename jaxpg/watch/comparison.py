@@ -15,7 +15,6 @@ import numpy as np
 from jaxpg.run import config as configuration
 from jaxpg.run import folder, results
 from jaxpg.run.agents import alone
-from jaxpg.run.config import Config
 from jaxpg.run.errors import UserError
 from jaxpg.run.statistics import improvement_interval, interquartile_mean, probability_of_improvement
 from jaxpg.watch.curves import PANELS, curve, finite
@@ -114,7 +113,7 @@ def _agents(path: str) -> Iterator[Agent]:
             metric: {line["steps"]: value for line in lines for value in _of_agent(line, metric, i)}
             for metric in PANELS
         }
-        yield Agent(_options(own), own.run.seed, curves)
+        yield Agent(configuration.named(own), own.run.seed, curves)
 
 
 def _of_agent(line: Json, metric: str, agent: int) -> Iterator[float]:
@@ -122,10 +121,6 @@ def _of_agent(line: Json, metric: str, agent: int) -> Iterator[float]:
     value = np.atleast_1d(np.array(line.get(metric), float))
     if len(value) > agent and np.isfinite(value[agent]):
         yield float(value[agent])
-
-
-def _options(config: Config) -> dict[str, Any]:
-    return dict(config.choices) | configuration.flatten(config)
 
 
 def _labels(options: Sequence[Mapping[str, Any]]) -> list[str]:

@@ -67,15 +67,10 @@ def report(run_folder: RunFolder, config: Config, stages: Mapping[str, StoredPol
         "curves": curves(config, lines),
         "tables": _settings(config, lines),
         "improvement": None,
-        "configuration": options(config),
+        "configuration": [[name, str(value)] for name, value in configuration.named(config).items()],
         "versions": _versions(run_folder),
     }
     return finite(data | episodes(stages, recordings))
-
-
-def options(config: Config) -> list[list[str]]:
-    """Every option with its value."""
-    return [[name, str(value)] for name, value in (dict(config.choices) | configuration.flatten(config)).items()]
 
 
 def _progress(lines: Sequence[Json]) -> list[list[str]]:
