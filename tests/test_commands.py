@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from processes import has_written
 
+from jaxpg.run import policies
 from jaxpg.run.checkpoint import Checkpoints
 
 TINY = (
@@ -248,6 +249,15 @@ def test_brax_environments_train(command, tmp_path, backend):
     assert result.returncode == 0, result.stderr
     assert result.stderr == ""
     assert len(metrics(folder)) == 4
+
+
+def test_a_policy_is_played_with_the_threads_of_a_training(monkeypatch, uninterrupted):
+    """Brax's environments hang on more than one with some releases of jaxlib, in an evaluation as in a training."""
+    prepared = []
+    monkeypatch.setattr(policies, "prepare", prepared.append)
+    stored = policies.load(str(uninterrupted[0]))
+    (config,) = prepared
+    assert config.choices == stored.config.choices
 
 
 def test_help_lists_every_option(command):

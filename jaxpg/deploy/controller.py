@@ -7,6 +7,7 @@ with the features phi and the network f of the actor, and squash = tanh or nothi
 
 from __future__ import annotations
 
+import functools
 import re
 from collections.abc import Callable
 from typing import Any, NamedTuple
@@ -126,6 +127,7 @@ def _learner(stored: StoredPolicy) -> Learner | None:
     )
 
 
+@functools.lru_cache(maxsize=8)  # brax's environments trace a reset each time they are asked for their sizes
 def interface(env: Any) -> Interface:
     """The environment's own, or numbers without names or limits where it has none, as brax's have not."""
     if hasattr(env, "interface"):

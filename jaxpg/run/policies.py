@@ -17,6 +17,7 @@ from jaxpg.run.checkpoint import Checkpoints
 from jaxpg.run.config import Config
 from jaxpg.run.errors import UserError
 from jaxpg.run.program import RUN_ONCE, initial_run, make_algorithm, make_env, make_networks, state_shape
+from jaxpg.run.runtime import prepare
 from jaxpg.run.state import Policy, current_policy
 
 
@@ -71,6 +72,7 @@ def load_several(
     """
     run_folder = folder.find(run)
     config = configuration.change(configuration.load(run_folder.config), changes or {})
+    prepare(config)  # environments of other libraries may hang without
     env = make_env(config)
     shape = state_shape(make_algorithm(config, env), config.num_agents)
     best, update = _restore(Checkpoints(run_folder.best, read_only=True), shape.best, run)
