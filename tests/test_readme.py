@@ -21,8 +21,8 @@ def blocks(language, page):
 
 def commands(page):
     """The lines that call Python, but for those that make its environment."""
-    lines = [line for block in blocks("bash", page) for line in block.splitlines() if ".venv/bin/python " in line]
-    return [line for line in lines if not line.startswith("python3 -m venv")]
+    lines = [line for block in blocks("bash", page) for line in block.splitlines()]
+    return [line for line in lines if line.startswith((".venv/bin/python ", "python "))]
 
 
 def pages_with(something):
@@ -63,8 +63,9 @@ def small(arguments):
     kept = [argument for argument in arguments if not argument.startswith("total_steps=")]
     if resumed:
         return [*kept, "total_steps=16", "report=false"]
-    rollout = [] if "algo=reinforce" in arguments else ["num_steps=2"]
-    return [*kept, *SIZES, *rollout, "total_steps=8"]
+    given = {argument.partition("=")[0] for argument in kept}
+    sizes = [*SIZES, "total_steps=8"] + ([] if "algo=reinforce" in arguments else ["num_steps=2"])
+    return [*kept, *(size for size in sizes if size.partition("=")[0] not in given)]
 
 
 @pytest.mark.parametrize("page", pages_with(commands))
@@ -88,7 +89,7 @@ def test_commands_run(page, place, command_environment):
 def test_no_command_is_left_out():
     """A change of the pages' form would leave the tests above with nothing to run."""
     assert len(commands("README.md")) >= 10
-    for page in ("quick_start.md", "watching.md", "deploy.md", "own_environment.md"):
+    for page in ("lesson.md", "quick_start.md", "watching.md", "deploy.md", "own_environment.md"):
         assert len(commands(page)) >= 3, page
     assert len(blocks("python", "README.md")) == 3
     assert len([line for line in blocks("python", "own_environment.md")[0].splitlines() if line]) == 40
