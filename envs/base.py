@@ -60,6 +60,17 @@ class Interface(NamedTuple):
     limits: tuple[float, ...] | None
 
 
+def interface(env: Any) -> Interface:
+    """The environment's own, or numbers without names or limits where it has none, as brax's have not."""
+    if hasattr(env, "interface"):
+        return env.interface
+    names, commands = (
+        tuple(f"{name}_{i}" for i in range(size))
+        for name, size in (("observation", env.observation_size), ("action", env.action_size))
+    )
+    return Interface(names, commands, limits=None)
+
+
 class MjxEnv:
     """What environments over one MuJoCo model share; a subclass adds `reset` and `step`.
 

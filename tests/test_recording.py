@@ -92,6 +92,10 @@ def test_a_clip_with_fewer_frames_is_every_so_many_steps_of_the_whole(recorded):
     assert short.episode_return == whole.episode_return
     np.testing.assert_allclose(short.so_far[1], whole.series["reward"][:3].sum(), rtol=1e-6)
     np.testing.assert_allclose(whole.so_far[-1], whole.episode_return, rtol=1e-6)
+    ended = clip(stored, recording._replace(length=np.full(STARTS, 7)), 1, most=10)
+    np.testing.assert_array_equal(ended.look.qpos, whole.look.qpos[[0, 3, 6, 7]])
+    np.testing.assert_array_equal(ended.series["reward"], whole.series["reward"][[0, 3, 6]])
+    assert ended.so_far[-1] == pytest.approx(ended.episode_return)
     assert list(short.series) == ["shoulder torque [N m]", "elbow torque [N m]", "reward", "value"]
 
 

@@ -7,10 +7,9 @@ with the features phi and the network f of the actor, and squash = tanh or nothi
 
 from __future__ import annotations
 
-import functools
 import re
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -97,7 +96,7 @@ def controller(stored: StoredPolicy, origin: dict[str, str]) -> Controller:
     layers = [dense[f"Dense_{i}"] for i in range(len(dense))]
     return Controller(
         name=re.sub(r"\W", "_", config.task),
-        interface=interface(stored.env),
+        interface=stored.interface,
         mean=np.asarray(stored.policy.normalizer.mean),
         scale=np.asarray(normalization.inverse_deviation(stored.policy.normalizer)),
         features=network.features,
@@ -127,26 +126,14 @@ def _learner(stored: StoredPolicy) -> Learner | None:
     )
 
 
-@functools.lru_cache(maxsize=8)  # brax's environments trace a reset each time they are asked for their sizes
-def interface(env: Any) -> Interface:
-    """The environment's own, or numbers without names or limits where it has none, as brax's have not."""
-    if hasattr(env, "interface"):
-        return env.interface
-    names, commands = (
-        tuple(f"{name}_{i}" for i in range(size))
-        for name, size in (("observation", env.observation_size), ("action", env.action_size))
-    )
-    return Interface(names, commands, limits=None)
-
-
 def commanding(stored: StoredPolicy) -> Callable[[jax.Array], jax.Array]:
     """`command(obs)`, `[..., n]` to `[..., m]`: the controller as JAX computes it."""
-    return lambda obs: physical(stored.env, stored.act(stored.policy, obs))
+    return lambda obs: physical(stored.interface, stored.act(stored.policy, obs))
 
 
-def physical(env: Any, action: jax.Array) -> jax.Array:
-    """What an action `[..., m]` commands in this environment, in physical units and within the limits."""
-    limits = interface(env).limits
+def physical(interface: Interface, action: jax.Array) -> jax.Array:
+    """What an action `[..., m]` commands, in physical units and within the limits."""
+    limits = interface.limits
     return action if limits is None else jnp.array(limits) * jnp.clip(action, -1.0, 1.0)
 
 

@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
+from envs.base import Interface, interface
 from jaxpg import normalization
 from jaxpg.actor_critic import deterministic_policy
 from jaxpg.run import config as configuration
@@ -29,6 +30,7 @@ class StoredPolicy(NamedTuple):
       value: `value(policy, obs) -> V`, what the critic expects of the discounted rewards to come, in their units.
       policy: its parameters; an argument of `act`, so that all policies of a kind are one compiled program.
       env: the environment, with the changes asked for.
+      interface: what its numbers are; kept, as brax's environments trace a reset to know how many they have.
       config: of the agent as a run of its own, with the changes.
       agent: in words, such as "seed 3".
       update: updates made when the checkpoint was written.
@@ -38,6 +40,7 @@ class StoredPolicy(NamedTuple):
     value: Callable[[Policy, Any], Any]
     policy: Policy
     env: Any
+    interface: Interface
     config: Config
     agent: str
     update: int
@@ -101,7 +104,7 @@ def stored_policy(config: Config, env: Any, policy: Policy, update: int, agent: 
     def value(policy, obs):
         return networks.value(policy.params["critic"], normalization.normalize(policy.normalizer, obs)) / reward_scale
 
-    return StoredPolicy(act, value, policy, env, config, agent, update)
+    return StoredPolicy(act, value, policy, env, interface(env), config, agent, update)
 
 
 def untrained(stored: StoredPolicy) -> StoredPolicy:

@@ -9,7 +9,6 @@ from typing import Any
 import numpy as np
 
 from envs.scenes import PhasePlane, Scene, scene
-from jaxpg.deploy.controller import interface
 from jaxpg.run.policies import StoredPolicy
 from jaxpg.watch import drawing
 from jaxpg.watch.clips import Clip, clip
@@ -52,7 +51,7 @@ def _player(
     ]
     picture = drawing.picture(view.model)
     drawn = [[drawing.draw(picture, one.look.qpos, one.look.goal) for one in clips] for clips in stage_clips]
-    names, limits = interface(stored.env).commands, interface(stored.env).limits
+    names, limits = stored.interface.commands, stored.interface.limits
     return {
         "dt": stage_clips[0][0].dt,
         "view": drawing.extent([frames for several in drawn for frames in several], picture.radius, MARGIN),

@@ -77,7 +77,7 @@ def _play(stored: StoredPolicy, policy: Policy, starts: jax.Array) -> Recording:
         after = jax.vmap(env.step)(state, action)
         return after, (
             look(after),
-            physical(env, action),
+            physical(stored.interface, action),
             after.reward,
             stored.value(policy, state.obs),
             after.done,

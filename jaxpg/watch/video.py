@@ -13,7 +13,6 @@ import jax
 import numpy as np
 
 from envs.scenes import Scene, scene
-from jaxpg.deploy.controller import interface
 from jaxpg.run import folder, policies
 from jaxpg.run.agents import described
 from jaxpg.run.cache import compilation_cache, physics_cache
@@ -21,7 +20,7 @@ from jaxpg.run.errors import UserError
 from jaxpg.run.policies import StoredPolicy
 from jaxpg.run.schema import RenderOptions
 from jaxpg.watch import gl, movie
-from jaxpg.watch.clips import Clip, clip
+from jaxpg.watch.clips import Clip, clip, frames
 from jaxpg.watch.recording import record
 
 LARGEST = 8192  # pixels of an image, either way
@@ -113,8 +112,7 @@ def pace(dt: float, speed: float, most: int) -> tuple[int, Fraction]:
 
 def shown(clips: Sequence[Clip], every: int) -> list[int]:
     """The steps that are shown: up to the last one of the longest episode, that one included."""
-    last = max(len(one.look.qpos) for one in clips) - 1
-    return [*range(0, last, every), last]
+    return frames(max(len(one.look.qpos) for one in clips) - 1, every)
 
 
 def images(
@@ -142,8 +140,8 @@ def cell(stored: StoredPolicy, view: Scene, one: Clip, step: int) -> Any:
     from jaxpg.watch.canvas import Cell
 
     last = len(one.look.qpos) - 1
-    now, names = min(step, last), interface(stored.env).commands
-    limits = np.array(interface(stored.env).limits or [1.0] * len(names))
+    now, names = min(step, last), stored.interface.commands
+    limits = np.array(stored.interface.limits or [1.0] * len(names))
     commands = np.array([one.series[name][now] if now < last else 0.0 for name in names])
     efforts = commands / limits if len(names) == view.model.nu else np.zeros(view.model.nu)
     goal = None if one.look.goal is None else one.look.goal[now]
