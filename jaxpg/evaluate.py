@@ -9,18 +9,16 @@ from contextlib import AbstractContextManager, nullcontext
 from typing import Any
 
 from jaxpg.run import config
-from jaxpg.run.commands import about_a_run
+from jaxpg.run.commands import about_a_run_in
 from jaxpg.run.errors import UserError, run_command
 from jaxpg.run.schema import EvaluateOptions
 
 
 def main(arguments: Sequence[str]) -> int:
     """The evaluation command; returns its exit status."""
-    of_env = [argument for argument in arguments if argument.startswith("env.")]
-    options = about_a_run("evaluate", EvaluateOptions, [argument for argument in arguments if argument not in of_env])
+    options, changes = about_a_run_in("evaluate", EvaluateOptions, arguments)
     if options is None:
         return 0
-    changes = config.parse(of_env)
     from jaxpg.run import episodes, policies
     from jaxpg.run.cache import compilation_cache, physics_cache
 

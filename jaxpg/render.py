@@ -4,20 +4,18 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from jaxpg.run import config
-from jaxpg.run.commands import about_a_run
+from jaxpg.run.commands import about_a_run_in
 from jaxpg.run.errors import run_command
 from jaxpg.run.schema import RenderOptions
 
 
 def main(arguments: Sequence[str]) -> int:
     """The render command; returns its exit status."""
-    of_env = [argument for argument in arguments if argument.startswith("env.")]
-    options = about_a_run("render", RenderOptions, [argument for argument in arguments if argument not in of_env])
+    options, changes = about_a_run_in("render", RenderOptions, arguments)
     if options is not None:
         from jaxpg.watch import video
 
-        video.render(options, config.parse(of_env), print)
+        video.render(options, changes, print)
     return 0
 
 

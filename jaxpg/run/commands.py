@@ -41,3 +41,10 @@ def about_a_run(command: str, schema: type, arguments: Sequence[str]) -> Any:
     if options.run is None:
         raise UserError("run=DIR is missing: the folder of a run, such as runs/pendulum")
     return options
+
+
+def about_a_run_in(command: str, schema: type, arguments: Sequence[str]) -> tuple[Any, dict[str, Any]]:
+    """As `about_a_run`, with the changes to the run's environment, `env.NAME=VALUE`, apart."""
+    of_env = [argument for argument in arguments if argument.startswith("env.")]
+    options = about_a_run(command, schema, [argument for argument in arguments if argument not in of_env])
+    return options, config.parse(of_env)
