@@ -33,11 +33,11 @@ import numpy as np
 from jaxpg.run import lock
 from jaxpg.run.config import Config
 from jaxpg.run.errors import UserError
+from jaxpg.run.files import UNFINISHED, replace
 from jaxpg.run.loggers import UntilItFails, values_of
 from jaxpg.run.loggers.follower import Follower
 from jaxpg.run.loggers.tensorboard import TensorBoard
 
-UNFINISHED = ".unfinished"  # ends the name of a file that is renamed once it is complete
 RECORDED_PACKAGES = ("jax", "jaxlib", "mujoco", "mujoco-mjx", "brax", "flax", "optax", "orbax-checkpoint", "numpy")
 
 
@@ -135,25 +135,6 @@ def _reported(path: Path) -> Iterator[None]:
         yield
     except OSError as error:
         raise UserError(f"{path}: cannot write a run folder there ({error.strerror})") from error
-
-
-def replace(path: Path, text: str) -> None:
-    """Writes a file that others, and who comes after a kill or a power failure, see as it was or whole.
-
-    Raises:
-      UserError: it cannot be written.
-    """
-    unfinished = path.with_name(path.name + UNFINISHED)
-    try:
-        with unfinished.open("w", encoding="utf-8") as file:
-            file.write(text)
-            file.flush()
-            os.fsync(file.fileno())
-        unfinished.replace(path)
-    except OSError as error:
-        with contextlib.suppress(OSError):
-            unfinished.unlink(missing_ok=True)
-        raise UserError(f"{path}: cannot be written ({error.strerror})") from error
 
 
 def find(path: str) -> RunFolder:

@@ -1,0 +1,200 @@
+"""Files in folders whose content may be somebody else's: read and written where they are meant, and nowhere else.
+
+A folder that is owned is held by a descriptor: what is read or written in it goes there, wherever it has been moved
+and whatever has taken its name since. Links inside a run folder are never followed: it may have come from anywhere.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import fcntl
+import os
+import secrets
+import stat
+from collections.abc import Iterator
+from pathlib import Path
+
+from jaxpg.run.errors import UserError
+
+UNFINISHED = ".unfinished"  # ends the name of a file that is renamed once it is complete
+FOLDER = os.O_RDONLY | os.O_DIRECTORY
+A_LINK = "it is a link, and what is in a run folder must be its own"
+
+_owned: dict[Path, int] = {}  # the folders that this process owns, by the names that they were given
+
+
+def replace(path: str | Path, content: str | bytes) -> None:
+    """Writes a file that others, and who comes after a kill or a power failure, see as it was or whole.
+
+    A link of that name is replaced, and what it leads to stays as it is.
+
+    Args:
+      path: the file; its folder is there already.
+      content: text is written as UTF-8, what no text can have (a file's name may) as an escape.
+
+    Raises:
+      UserError: it cannot be written.
+    """
+    path = Path(path)
+    data = content.encode("utf-8", "backslashreplace") if isinstance(content, str) else content
+    try:
+        with opened(path.parent) as folder:
+            _replace(folder, path.name, data)
+    except OSError as error:
+        raise UserError(f"{path}: cannot be written ({error.strerror})") from error
+
+
+def _replace(folder: int, name: str, content: bytes) -> None:
+    unfinished = f".{secrets.token_hex(8)}{UNFINISHED}"
+    descriptor = os.open(unfinished, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o666, dir_fd=folder)
+    try:
+        with os.fdopen(descriptor, "wb") as file:
+            file.write(content)
+            file.flush()
+            os.fsync(file.fileno())
+        os.replace(unfinished, name, src_dir_fd=folder, dst_dir_fd=folder)
+    except OSError:
+        with contextlib.suppress(OSError):
+            os.unlink(unfinished, dir_fd=folder)
+        raise
+
+
+def read(path: str | Path) -> bytes:
+    """The content of a file.
+
+    Raises:
+      FileNotFoundError: there is none. UserError: it cannot be read, or is a folder, a link or a device.
+    """
+    path = Path(path)
+    try:
+        with opened(path.parent) as folder, os.fdopen(open_in(folder, path.name, os.O_RDONLY), "rb") as file:
+            return file.read()
+    except FileNotFoundError:
+        raise
+    except OSError as error:
+        raise UserError(f"{path}: cannot be read ({error.strerror})") from error
+
+
+def open_in(folder: int, name: str, flags: int) -> int:
+    """A descriptor of the file of this name in an open folder; raises OSError for what is no file of its own."""
+    descriptor = _open(name, flags | os.O_NONBLOCK, folder)  # or a pipe would wait for somebody to write
+    mode = os.fstat(descriptor).st_mode
+    if not stat.S_ISREG(mode):
+        os.close(descriptor)
+        raise OSError(errno.EISDIR if stat.S_ISDIR(mode) else errno.EINVAL, "it is no file")
+    return descriptor
+
+
+@contextlib.contextmanager
+def opened(folder: Path, make: bool = False) -> Iterator[int]:
+    """A descriptor of a folder, inside.
+
+    Args:
+      folder: one that is owned or in one that is, another run's or its folder, or any.
+      make: where there is none; not those above it.
+
+    Raises:
+      OSError: there is none, or it is a link inside a run folder.
+    """
+    descriptor = open_folder(folder, make)
+    try:
+        yield descriptor
+    finally:
+        os.close(descriptor)
+
+
+def open_folder(folder: Path, make: bool = False) -> int:
+    """As `opened`; to be closed."""
+    for root, owner in _owned.items():
+        if Path(os.path.abspath(folder)).is_relative_to(root):
+            return _open_own(os.path.relpath(folder, root), owner, make)
+    if (folder.parent / "config.yaml").exists():
+        return _open_own(os.path.abspath(folder), None, make)
+    if make:
+        folder.mkdir(exist_ok=True)
+    return os.open(folder, FOLDER)
+
+
+def _open_own(name: str, parent: int | None, make: bool) -> int:
+    """A folder of a run."""
+    if make:
+        with contextlib.suppress(FileExistsError):
+            os.mkdir(name, dir_fd=parent)
+    return _open(name, FOLDER, parent)
+
+
+def _open(name: str, flags: int, parent: int | None) -> int:
+    try:
+        return os.open(name, flags | os.O_NOFOLLOW, 0o666, dir_fd=parent)
+    except OSError:
+        if is_link(name, parent):
+            raise OSError(errno.ELOOP, A_LINK) from None
+        raise
+
+
+def is_link(name: str, parent: int | None) -> bool:
+    """Whether there is a link of this name."""
+    try:
+        return stat.S_ISLNK(os.stat(name, dir_fd=parent, follow_symlinks=False).st_mode)
+    except OSError:
+        return False
+
+
+@contextlib.contextmanager
+def owned(path: Path, descriptor: int) -> Iterator[None]:
+    """Whatever is read or written below `path` inside is in the open folder `descriptor`."""
+    name = Path(os.path.abspath(path))
+    _owned[name] = descriptor
+    try:
+        yield
+    finally:
+        del _owned[name]
+
+
+def whereabouts(path: Path) -> Path:
+    """Where an owned folder is now: it may have been moved. Any other is where it is; one that was removed, where it was."""
+    descriptor = _owned.get(Path(os.path.abspath(path)))
+    if descriptor is None or is_at(path, descriptor):
+        return path
+    name = _name(descriptor)
+    return name if name and is_at(name, descriptor) else path
+
+
+def is_at(path: str | Path, descriptor: int, parent: int | None = None) -> bool:
+    """Whether the open file or folder has this path."""
+    try:
+        return os.path.samestat(os.stat(path, dir_fd=parent), os.fstat(descriptor))
+    except OSError:
+        return False
+
+
+def through(descriptor: int) -> Path:
+    """A path to an open folder for libraries that take nothing else.
+
+    On Linux it leads there whatever the folder's name is or becomes. Elsewhere it is the name that it has now.
+
+    Raises:
+      OSError: it has none any more.
+    """
+    path = Path(f"/proc/self/fd/{descriptor}")
+    name = path if is_at(path, descriptor) else _name(descriptor)
+    if name is None or not is_at(name, descriptor):
+        raise OSError(errno.ENOENT, "the folder has been moved or removed")
+    return name
+
+
+def goes_through() -> bool:
+    """Whether paths through descriptors hide the folders' names from libraries, which take some letters for patterns."""
+    with opened(Path("/")) as folder:
+        return is_at(f"/proc/self/fd/{folder}", folder)
+
+
+def _name(descriptor: int) -> Path | None:
+    """The name that an open folder has now, if the system tells."""
+    try:
+        if hasattr(fcntl, "F_GETPATH"):
+            return Path(os.fsdecode(fcntl.fcntl(descriptor, fcntl.F_GETPATH, bytes(1024)).rstrip(b"\0")))
+        return Path(os.readlink(f"/proc/self/fd/{descriptor}"))
+    except OSError:
+        return None
