@@ -13,13 +13,14 @@ import jax
 import jax.numpy as jnp
 import optax
 
-from jaxpg import baselines, collectives, estimators, normalization
+from jaxpg import baselines, collectives, divergence, estimators, normalization
 from jaxpg.distributions import gaussian_sample
 from jaxpg.estimators import Estimate
 from jaxpg.learning import Batch, Reuse, actor_critic_loss, one_step, several_steps
 from jaxpg.networks import Networks
 from jaxpg.returns import discount_factors
 from jaxpg.rollout import PolicyFn, rollout
+from jaxpg.shapes import select
 from jaxpg.types import Algorithm, Metrics, PyTree, TrainState, Transition
 from jaxpg.vector_env import VectorEnv, VectorState, episode_metrics, stagger
 
@@ -144,6 +145,8 @@ def actor_critic(
       reward_scale: factor on the rewards that the estimator and the critic see; reported returns are not scaled.
       entropy_coef: weight of the policy's entropy; of a squashed one estimated by its samples.
       normalize_observations: feed the networks (s - mean) / std with running statistics, updated after each step.
+        Episodes whose physics diverges in the rollout, or is about to, are left out of them and of what is learned
+        (`learned_from`); where nothing is left, the parameters stay as they are.
       normalize_advantages: mean 0 and standard deviation 1 over the rollout.
       axis_name: a mapped axis, along which further parts of the agent's environments are (`jaxpg.shards`); not with
         `reinforce`, whose baselines and masks are of one part.
@@ -172,12 +175,15 @@ def actor_critic(
         policy_fn = sampling_policy(networks, state.params, state.normalizer)
         key_rollout = collectives.own(key_rollout, axis_name)
         env_state, transition = method.collect(env, policy_fn, state.env_state, key_rollout)
-        batch = prepare(state.params, state.normalizer, transition)
-        params, opt_state, metrics = learn(state.params, state.opt_state, batch, key_learn)
-        normalizer = state.normalizer
-        if normalize_observations:
-            normalizer = normalization.update(normalizer, transition.obs, axis_name)
-        metrics = metrics | episode_metrics(transition, axis_name)
+        sound = divergence.lasting(transition.diverged > 0, transition.ended)
+        statistics = normalization.update(state.normalizer, transition.obs, axis_name, sound)
+        counts = learned_from(transition, statistics)
+        batch = prepare(state.params, state.normalizer, transition, counts)
+        learned = learn(state.params, state.opt_state, batch, key_learn)
+        something = collectives.largest(jnp.max(batch.weight), axis_name) > 0
+        params, opt_state = select(something, learned[:2], (state.params, state.opt_state))
+        normalizer = statistics if normalize_observations else state.normalizer
+        metrics = learned[2] | episode_metrics(transition, axis_name)
         return TrainState(params, opt_state, normalizer, env_state, state.update + 1), metrics
 
     return Algorithm(init, step)
@@ -191,14 +197,19 @@ def batch_of(
     normalize_advantages: bool,
     axis_name: str | None = None,
 ) -> Callable[[PyTree, PyTree, Transition], Batch]:
-    """`prepare(params, normalizer, transition) -> Batch`: the advantages of a rollout, and what they are made of.
+    """`prepare(params, normalizer, transition, counts) -> Batch`: a rollout's advantages, and what they are made of.
+
+    Steps that do not count, `[T, N]` of bool, have the weight 0; their numbers are replaced before anything is computed
+    with them, so that none of it can overflow.
 
     Args:
       networks, method, reward_scale, normalize_advantages, axis_name: as in `actor_critic`.
       episode_length: the time limit.
     """
 
-    def prepare(params, normalizer, transition):
+    def prepare(params, normalizer, transition, counts=True):
+        counts = jnp.broadcast_to(counts, transition.reward.shape)
+        transition = harmless(transition, counts, normalizer)
         obs = normalization.normalize(normalizer, transition.obs)
         value = networks.value(params["critic"], obs)
 
@@ -206,18 +217,48 @@ def batch_of(
             return networks.value(params["critic"], normalization.normalize(normalizer, x))
 
         next_value = next_values(value_fn, value, transition, episode_length)
-        weight = method.weight(transition)
+        weight = jnp.where(counts, method.weight(transition), 0.0)
         scaled = transition._replace(reward=reward_scale * transition.reward)
         mean, log_std = networks.policy(params["actor"], obs)
         squared_score = jnp.sum(jnp.square((transition.u - mean) * jnp.exp(-2 * log_std)), axis=-1)
         advantage, target = method.estimate(scaled, weight, value, next_value, squared_score)
         if normalize_advantages:
             advantage = estimators.normalize_advantages(advantage, weight, axis_name=axis_name)
+        advantage = jnp.where(weight > 0, advantage, 0.0)
         log_prob = networks.distribution.log_prob(transition.u, mean, log_std)
         log_std = jnp.broadcast_to(log_std, mean.shape)
         return Batch(obs, transition.u, mean, log_std, log_prob, value, advantage, target, weight)
 
     return prepare
+
+
+def learned_from(transition: Transition, statistics: normalization.RunningStatistics) -> jax.Array:
+    """Which steps are learned from, `[T, N]` of bool: those of episodes that stay sound to their end or the rollout's.
+
+    An episode does not where its physics diverges, or where it is about to: an observation is further than
+    `jaxpg.divergence.FAR` deviations from the mean, or the policy drew a number that is not finite. All of its steps
+    before that are left out too: a joint that explodes passes through any size on its way.
+
+    Args:
+      transition: of a rollout.
+      statistics: of the observations, this rollout's sound ones included.
+    """
+    at_home = [normalization.near(statistics, x, divergence.FAR) for x in (transition.obs, transition.next_obs)]
+    drawn = jnp.all(jnp.isfinite(transition.u), axis=-1)
+    bad = (transition.diverged > 0) | ~at_home[0] | ~at_home[1] | ~drawn
+    return divergence.lasting(bad, transition.ended)
+
+
+def harmless(transition: Transition, counts: jax.Array, statistics: normalization.RunningStatistics) -> Transition:
+    """The rollout with steps that do not count replaced: mean observations, drawn and earned 0."""
+    mean = jnp.broadcast_to(statistics.mean, transition.obs.shape)
+    replaced = {
+        "obs": mean,
+        "next_obs": mean,
+        "u": jnp.zeros_like(transition.u),
+        "reward": jnp.zeros_like(transition.reward),
+    }
+    return transition._replace(**{name: select(counts, getattr(transition, name), x) for name, x in replaced.items()})
 
 
 def next_values(

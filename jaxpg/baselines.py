@@ -33,7 +33,8 @@ def batch_mean(returns: jax.Array, weight: jax.Array | float = 1.0) -> jax.Array
 
     Args:
       returns: G_t, `[T, ...]`.
-      weight: 1 where the step belongs to the episode and 0 after its end, `[T, ...]` or a scalar.
+      weight: 1 where the step belongs to the episode and 0 after its end, `[T, ...]` or a scalar. Where nothing counts
+        that a mean would be of, it is 0.
 
     Raises:
       ValueError: the weight's shape does not fit.
@@ -44,7 +45,7 @@ def batch_mean(returns: jax.Array, weight: jax.Array | float = 1.0) -> jax.Array
     [2.5, 2.5]
     """
     weight = spread(weight, returns, "weight")
-    return jnp.broadcast_to(jnp.sum(weight * returns) / jnp.sum(weight), returns.shape)
+    return jnp.broadcast_to(_ratio(jnp.sum(weight * returns), jnp.sum(weight)), returns.shape)
 
 
 def time_mean(returns: jax.Array, weight: jax.Array | float = 1.0) -> jax.Array:
@@ -90,7 +91,7 @@ def leave_one_out(returns: jax.Array, weight: jax.Array | float = 1.0) -> jax.Ar
         raise ValueError(f"returns have shape {returns.shape}, expected [T, N] with at least 2 trajectories")
     weight = spread(weight, returns, "weight")
     total, count = jnp.sum(weight * returns, axis=0), jnp.sum(weight, axis=0)
-    return jnp.broadcast_to((jnp.sum(total) - total) / (jnp.sum(count) - count), returns.shape)
+    return jnp.broadcast_to(_ratio(jnp.sum(total) - total, jnp.sum(count) - count), returns.shape)
 
 
 def optimal(returns: jax.Array, squared_score: jax.Array, weight: jax.Array | float = 1.0) -> jax.Array:
@@ -117,5 +118,9 @@ def optimal(returns: jax.Array, squared_score: jax.Array, weight: jax.Array | fl
     weight = spread(weight, returns, "weight") * same(squared_score, returns, "squared_score")
     across = tuple(range(1, returns.ndim))
     total = jnp.sum(weight, axis=across, keepdims=True)
-    mean = jnp.sum(weight * returns, axis=across, keepdims=True) / jnp.where(total == 0, 1, total)
-    return jnp.broadcast_to(mean, returns.shape)
+    return jnp.broadcast_to(_ratio(jnp.sum(weight * returns, axis=across, keepdims=True), total), returns.shape)
+
+
+def _ratio(total: jax.Array, count: jax.Array) -> jax.Array:
+    """total / count, 0 where both are 0."""
+    return total / jnp.where(count == 0, 1, count)

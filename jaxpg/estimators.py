@@ -208,6 +208,7 @@ def normalize_advantages(
     advantage = floating(advantage)
     weight = spread(weight, advantage, "weight")
     total = collectives.total(jnp.sum(weight), axis_name)
+    total = jnp.where(total == 0, 1.0, total)  # nothing counts
     centred = advantage - collectives.total(jnp.sum(weight * advantage), axis_name) / total
     largest = collectives.largest(jnp.max(jnp.abs(weight * advantage)), axis_name)
     variance = collectives.total(jnp.sum(weight * centred**2), axis_name) / total + (epsilon * largest) ** 2

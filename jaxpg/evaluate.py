@@ -6,12 +6,16 @@ import json
 import math
 from collections.abc import Sequence
 from contextlib import AbstractContextManager, nullcontext
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from jaxpg.run import config
 from jaxpg.run.commands import about_a_run_in
 from jaxpg.run.errors import UserError, run_command
 from jaxpg.run.schema import EvaluateOptions
+from jaxpg.run.statistics import finite_mean
+
+if TYPE_CHECKING:
+    from jaxpg.run.episodes import Results
 
 
 def main(arguments: Sequence[str]) -> int:
@@ -28,22 +32,44 @@ def main(arguments: Sequence[str]) -> int:
         stored = policies.load(options.run, options.checkpoint, options.agent, changes)
     play = episodes.play_gymnasium if options.backend == "gymnasium" else episodes.play_own
     with _playing(stored, options.policy) as player, compilation_cache(options.cache, print):
-        returns, metrics = play(player, options.episodes, options.seed)
-    mean, stderr = returns.mean(), returns.std(ddof=1) / math.sqrt(len(returns))
-    saved = f"{options.checkpoint} policy (saved after {stored.update:,} updates)"
+        results = play(player, options.episodes, options.seed)
     how = options.backend if options.policy == "jax" else f"{options.backend}, as {options.policy}"
-    print(f"{stored.config.task}, {stored.agent}, {saved}, {how}")
-    print(f"return   {mean:.2f} +- {stderr:.2f} (mean and standard error, {len(returns)} episodes)")
-    for metric, values in metrics.items():
-        print(
-            f"{metric:<8} {values.mean():.2%}"
-            if metric == "success"
-            else f"{metric:<8} {values.mean():.4g} on average at the end"
-        )
+    print(f"{stored.config.task}, {stored.agent}, {stored.described(options.checkpoint)}, {how}")
+    for name, value in _rows(results).items():
+        print(f"{name:<8} {value}")
     if options.json:
-        success = float(metrics["success"].mean()) if "success" in metrics else None
-        print(json.dumps({"mean": float(mean), "stderr": float(stderr), "episodes": len(returns), "success": success}))
+        print(json.dumps(_summary(results), allow_nan=False))
     return 0
+
+
+def _rows(results: Results) -> dict[str, str]:
+    """What is to be read, by name; an episode that diverged counts as `jaxpg.run.statistics.counted_returns` says."""
+    number, exploded = len(results.returns), int(results.diverged.sum())
+    mean, stderr = _mean(results.returns)
+    rows = {"return": f"{mean:.2f} +- {stderr:.2f} (mean and standard error, {number} episodes)"}
+    if exploded == number:
+        rows["return"] = f"n/a: the physics of all {number} episodes diverged"
+    elif exploded:
+        rows["diverged"] = f"{exploded} of {number} episodes, each counted as the worst of the others, and as 0 at best"
+    for name, values in results.metrics.items():
+        value = finite_mean(values)
+        rows[name] = f"{value:.2%}" if name == "success" else f"{value:.4g} on average at the end"
+    return rows
+
+
+def _summary(results: Results) -> dict[str, Any]:
+    """The same as numbers, None where there is none."""
+    mean, stderr = _mean(results.returns)
+    success = finite_mean(results.metrics["success"]) if "success" in results.metrics else math.nan
+    numbers = {"mean": mean, "stderr": stderr, "success": float(success)}
+    counts = {"episodes": len(results.returns), "diverged": int(results.diverged.sum())}
+    return {name: value if math.isfinite(value) else None for name, value in numbers.items()} | counts
+
+
+def _mean(returns: Any) -> tuple[float, float]:
+    """Mean and standard error; NaN where there is none, the latter of a single episode, too."""
+    number = len(returns)
+    return float(returns.mean()), float(returns.std(ddof=1)) / math.sqrt(number) if number > 1 else math.nan
 
 
 def _in_mujoco(run: str) -> dict[str, str]:

@@ -11,12 +11,12 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
-from jaxpg import normalization
-from jaxpg.actor_critic import sampling_policy
+from jaxpg import divergence, normalization
+from jaxpg.actor_critic import harmless, sampling_policy
 from jaxpg.networks import Networks
 from jaxpg.returns import td_errors
 from jaxpg.rollout import rollout
-from jaxpg.shapes import along
+from jaxpg.shapes import along, select
 from jaxpg.types import Algorithm, Metrics, PyTree, TrainState, Transition
 from jaxpg.vector_env import VectorEnv, episode_metrics, stagger
 
@@ -73,6 +73,10 @@ def online_actor_critic(
       discounted: with the factor I = gamma^t; without it I = 1, as in the lesson.
       normalize_observations: feed the networks (s - mean) / std with running statistics, updated after `num_steps`.
 
+    A step whose physics diverges is not learned from; nor, with normalized observations, one further than
+    `jaxpg.divergence.FAR` deviations from their mean, as a joint that explodes is before. The steps before those have
+    been learned from when that is seen: they were like any others.
+
     Returns:
       `Algorithm(init, step)` with the metrics of `actor_critic`, as far as there are some.
 
@@ -98,14 +102,16 @@ def online_actor_critic(
             policy_fn = sampling_policy(networks, params, state.normalizer)
             env_state, transition = rollout(policy_fn, env.step, env_state, key, length=1)
             transition = jax.tree.map(lambda x: x[0], transition)
-            params, traces, metrics = update(params, traces, state.normalizer, transition)
+            counts = learned_from(transition, state.normalizer, normalize_observations)
+            params, traces, metrics = update(params, traces, state.normalizer, transition, counts)
             return (params, traces, env_state), (transition, metrics)
 
         carry = state.params, state.opt_state, state.env_state
         (params, traces, env_state), (transition, metrics) = jax.lax.scan(one, carry, jax.random.split(key, num_steps))
         normalizer = state.normalizer
         if normalize_observations:
-            normalizer = normalization.update(normalizer, transition.obs)
+            sound = divergence.lasting(transition.diverged > 0, transition.ended)
+            normalizer = normalization.update(normalizer, transition.obs, counts=sound)
         metrics = jax.tree.map(jnp.mean, metrics) | episode_metrics(transition)
         return TrainState(params, traces, normalizer, env_state, state.update + 1), metrics
 
@@ -122,26 +128,31 @@ def trace_update(
     reward_scale: float,
     discounted: bool,
 ) -> Callable[[PyTree, Traces, PyTree, Transition], tuple[PyTree, Traces, Metrics]]:
-    """`update(params, traces, normalizer, transition) -> (params, traces, metrics)`: the one of `online_actor_critic`.
+    """`update(params, traces, normalizer, transition, counts) -> (params, traces, metrics)`: `online_actor_critic`'s.
 
     Args:
       networks, gamma, lambda_actor, lambda_critic, actor_lr, critic_lr, reward_scale, discounted: as there.
 
-    The transition is one step of each environment, `[N, ...]`.
+    The transition is one step of each environment, `[N, ...]`. Of those that do not count, `[N]` of bool, the
+    traces decay, and nothing is added to anything.
     """
 
     def log_prob(actor, obs, u):
         mean, log_std = networks.policy(actor, obs)
         return networks.distribution.log_prob(u, mean, log_std), jnp.exp(log_std)
 
-    def update(params, traces, normalizer, transition):
+    def update(params, traces, normalizer, transition, counts=True):
+        counts = jnp.broadcast_to(counts, transition.reward.shape)
+        transition = harmless(transition, counts, normalizer)
         obs = normalization.normalize(normalizer, transition.obs)
         next_obs = normalization.normalize(normalizer, transition.next_obs)
         value, value_gradient = _each(jax.value_and_grad(networks.value))(params["critic"], obs)
         score, sigma = _each(jax.grad(log_prob, has_aux=True))(params["actor"], obs, transition.u)
+        gradients = value_gradient, score
+        value_gradient, score = select(counts, gradients, jax.tree.map(jnp.zeros_like, gradients))
         discount = gamma * (1 - transition.terminated)
         next_value = networks.value(params["critic"], next_obs)
-        delta = td_errors(reward_scale * transition.reward, discount, value, next_value)
+        delta = jnp.where(counts, td_errors(reward_scale * transition.reward, discount, value, next_value), 0.0)
         z_critic = jax.tree.map(lambda z, g: gamma * lambda_critic * z + g, traces.critic, value_gradient)
         z_actor = jax.tree.map(lambda z, g: gamma * lambda_actor * z + along(traces.factor, g) * g, traces.actor, score)
         params = {
@@ -155,6 +166,15 @@ def trace_update(
         return params, Traces(z_actor, z_critic, factor), metrics
 
     return update
+
+
+def learned_from(transition: Transition, normalizer: PyTree, normalized: bool) -> jax.Array:
+    """Which environments' steps are learned from, `[N]` of bool; arguments as in `online_actor_critic`."""
+    sound = (transition.diverged == 0) & jnp.all(jnp.isfinite(transition.u), axis=-1)
+    if not normalized:
+        return sound
+    at_home = [normalization.near(normalizer, x, divergence.FAR) for x in (transition.obs, transition.next_obs)]
+    return sound & at_home[0] & at_home[1]
 
 
 def _ascend(params: PyTree, step_size: float, delta: jax.Array, traces: PyTree) -> PyTree:

@@ -5,6 +5,8 @@ Without it `[N]` against `[N, 1]` would be spread in silence to `[N, N]`.
 
 from __future__ import annotations
 
+from typing import Any
+
 import jax
 import jax.numpy as jnp
 
@@ -41,6 +43,21 @@ def along(x: jax.Array, reference: jax.Array) -> jax.Array:
     (3, 1, 1)
     """
     return x.reshape(x.shape + (1,) * (reference.ndim - 1))
+
+
+def select(mask: jax.Array, if_true: Any, if_false: Any) -> Any:
+    """Leaf by leaf of two trees `[N, ...]`: the rows of `if_true` where the mask holds, `[N]` or with further axes.
+
+    It selects and does not multiply: what is not finite in a row that is left out stays out.
+
+    >>> select(jnp.array([True, False]), jnp.array([[1.0], [jnp.nan]]), jnp.zeros((2, 1))).tolist()
+    [[1.0], [0.0]]
+    """
+
+    def rows(a, b):
+        return jnp.where(mask.reshape(mask.shape + (1,) * (b.ndim - mask.ndim)), a, b)
+
+    return jax.tree.map(rows, if_true, if_false)
 
 
 def same(x: jax.Array, reference: jax.Array, name: str) -> jax.Array:

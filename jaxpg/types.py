@@ -23,8 +23,8 @@ class Transition(NamedTuple):
       next_obs: the true s_{t+1}, the one before any reset, `[T, N, observation_size]`.
       episode_end: 1.0 where a whole episode, played from its first step, ended with the step, `[T, N]`.
       episode_return: the undiscounted return of that episode, 0 where none ended, `[T, N]`.
-      diverged: 1.0 where the physics gave a number that is not finite, `[T, N]`; the step terminated, with reward 0 and
-        the observation before it as the true next one.
+      diverged: 1.0 where the physics did (`jaxpg.divergence`), `[T, N]`; the step terminated, with reward 0 and the
+        observation before it as the true next one.
     """
 
     obs: jax.Array
@@ -36,6 +36,11 @@ class Transition(NamedTuple):
     episode_end: jax.Array
     episode_return: jax.Array
     diverged: jax.Array
+
+    @property
+    def ended(self) -> jax.Array:
+        """Whether an episode ended with the step, `[T, N]` of bool."""
+        return (self.terminated + self.truncated) > 0
 
 
 class TrainState(NamedTuple):

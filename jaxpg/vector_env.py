@@ -4,7 +4,8 @@ The environment is any object with brax's `reset(key) -> State` and `step(State,
 termination; the time limit is added here, as truncation. An environment that ended is reset at once with a fresh draw,
 and the observation from *before* the reset is handed out as s_{t+1}, for the bootstrap.
 
-A physics that diverges, as stiff models do at long time steps, ends the episode of its environment and no other's.
+A physics that diverges, as stiff models do at long time steps, ends the episode of its environment and no other's; what
+that is, `jaxpg.divergence` says.
 """
 
 from __future__ import annotations
@@ -16,7 +17,8 @@ import jax
 import jax.numpy as jnp
 
 from jaxpg import collectives
-from jaxpg.shapes import along
+from jaxpg.divergence import diverged
+from jaxpg.shapes import select
 from jaxpg.types import Metrics, Transition
 
 
@@ -86,20 +88,27 @@ def vectorize(env: Any, num_envs: int, episode_length: int) -> VectorEnv:
 
     def step(state, action, key):
         env_state = jax.vmap(env.step)(state.env, action)
-        finite = jnp.all(jnp.isfinite(env_state.obs), axis=-1) & jnp.isfinite(env_state.reward)
-        reward = jnp.where(finite, env_state.reward, 0.0)
-        next_obs = jnp.where(along(finite, env_state.obs), env_state.obs, state.obs)
+        exploded = jax.vmap(diverged)(state.env, env_state)
+        reward = jnp.where(exploded, 0.0, env_state.reward)
+        next_obs = select(exploded, state.obs, env_state.obs)
         time = state.time + 1
         episode_return = state.episode_return + reward
-        terminated = jnp.where(finite, env_state.done, 1).astype(reward.dtype)
+        terminated = jnp.where(exploded, 1, env_state.done).astype(reward.dtype)
         truncated = (time >= episode_length) * (1 - terminated)
         done = (terminated + truncated) > 0
         episode_end = done * state.whole
-        diverged = 1 - finite.astype(reward.dtype)
-        outcome = Outcome(reward, terminated, truncated, next_obs, episode_end, episode_end * episode_return, diverged)
+        outcome = Outcome(
+            reward=reward,
+            terminated=terminated,
+            truncated=truncated,
+            next_obs=next_obs,
+            episode_end=episode_end,
+            episode_return=episode_end * episode_return,
+            diverged=exploded.astype(reward.dtype),
+        )
         running = VectorState(env_state, time, episode_return, state.whole)
         # Drawing and observing new states costs as much as a step in some environments: only where one has ended.
-        return jax.lax.cond(jnp.any(done), lambda: _select(done, reset(key), running), lambda: running), outcome
+        return jax.lax.cond(jnp.any(done), lambda: select(done, reset(key), running), lambda: running), outcome
 
     return VectorEnv(reset, step, env.observation_size, env.action_size, num_envs, episode_length)
 
@@ -118,26 +127,18 @@ def episode_metrics(transition: Transition, axis_name: str | None = None) -> Met
     """What a rollout says of its episodes.
 
     `episodes` that ended and `return_sum`, the sum of their returns; `diverged`, how often the physics did, and
-    `diverged_env`, the first environment with it, or -1.
+    `diverged_env`, the first environment with it, or -1. Episodes that ended so are not among the first.
 
     Args:
       transition: of a rollout.
       axis_name: a mapped axis, along which there are further environments.
     """
+    exploded = transition.diverged > 0
     counted = {
-        "return_sum": transition.episode_return,
-        "episodes": transition.episode_end,
+        "return_sum": jnp.where(exploded, 0.0, transition.episode_return),
+        "episodes": jnp.where(exploded, 0.0, transition.episode_end),
         "diverged": transition.diverged,
     }
     counts = {name: collectives.total(jnp.sum(x), axis_name) for name, x in counted.items()}
-    where = jnp.any(transition.diverged > 0, axis=0)
+    where = jnp.any(exploded, axis=0)
     return counts | {"diverged_env": collectives.first_place(where, axis_name)}
-
-
-def _select(mask: jax.Array, if_true: Any, if_false: Any) -> Any:
-    """Leaf by leaf along the leading axis: `if_true` where the mask holds."""
-
-    def select(a, b):
-        return jnp.where(along(mask, b), a, b)
-
-    return jax.tree.map(select, if_true, if_false)

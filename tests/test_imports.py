@@ -20,6 +20,7 @@ LEVELS = [
         "losses",
         "distributions",
         "features",
+        "divergence",
         "normalization",
         "compatibility",
         "collectives",

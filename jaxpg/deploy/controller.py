@@ -7,6 +7,7 @@ with the features phi and the network f of the actor, and squash = tanh or nothi
 
 from __future__ import annotations
 
+import functools
 import re
 from collections.abc import Callable
 from typing import NamedTuple
@@ -17,6 +18,7 @@ import numpy as np
 
 from envs.base import Interface
 from jaxpg import normalization
+from jaxpg.evaluation import play
 from jaxpg.run.policies import StoredPolicy
 from jaxpg.run.schema import Online
 
@@ -147,16 +149,14 @@ def observations(stored: StoredPolicy) -> np.ndarray:
     key_start, key_drawn = jax.random.split(jax.random.key(0))
 
     @jax.jit
-    def play(policy):
-        def step(state, _):
-            return jax.vmap(stored.env.step)(state, stored.act(policy, state.obs)), state.obs
-
-        start = jax.vmap(stored.env.reset)(jax.random.split(key_start, NUM_EPISODES))
-        return jax.lax.scan(step, start, length=length)[1]
+    def played(policy):
+        act, starts = functools.partial(stored.act, policy), jax.random.split(key_start, NUM_EPISODES)
+        return play(stored.env, act, starts, length, lambda step: (step.before.obs, step.alive))[1]
 
     normalizer = jax.tree.map(np.asarray, stored.policy.normalizer)
     deviation = np.sqrt(normalizer.variance)
-    seen = np.asarray(play(stored.policy)).reshape(number, -1)
-    near = np.all(np.abs(seen - normalizer.mean) < FAR * deviation, axis=1)
+    obs, alive = (np.asarray(x) for x in played(stored.policy))
+    seen = obs[alive]
+    near = np.all(np.abs(seen - normalizer.mean) <= FAR * deviation, axis=1)
     drawn = np.asarray(jax.random.normal(key_drawn, (NUM_OBSERVATIONS - near.sum(), seen.shape[1])))
     return np.concatenate([seen[near], normalizer.mean + 2 * deviation * drawn]).astype(np.float32)

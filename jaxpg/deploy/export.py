@@ -138,7 +138,7 @@ def origin(options: ExportOptions, stored: StoredPolicy) -> dict[str, str]:
     run_folder = folder.find(options.run)
     which = run_folder.best if options.checkpoint == "best" else run_folder.checkpoints
     return {
-        "policy": f"{described(stored.config)}, {options.checkpoint} policy (saved after {stored.update:,} updates)",
+        "policy": f"{described(stored.config)}, {stored.described(options.checkpoint)}",
         "run": run_folder.path.resolve().name,
         "digest": Checkpoints(which, read_only=True).digest(stored.update),
     }

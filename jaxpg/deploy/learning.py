@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxpg.actor_critic import sampling_policy
+from jaxpg.actor_critic import learned_from, sampling_policy
 from jaxpg.networks import Networks, linear_mean
 from jaxpg.online import Traces, trace_update
 from jaxpg.rollout import rollout
@@ -21,7 +21,10 @@ NUM_STEPS = 1000
 
 
 def steps(stored: StoredPolicy) -> Transition:
-    """Steps of one environment under the policy with its noise, `[T, 1, ...]`."""
+    """Steps of one environment under the policy with its noise, `[T, 1, ...]`; no episode whose physics diverges.
+
+    A controller learns from what it is given: that a robot's numbers are sane is for its own program to see.
+    """
     networks = make_networks(stored.config, stored.env)
     vector = vectorize(stored.env, 1, stored.config.env.episode_length)
     key_reset, key_rollout = jax.random.split(jax.random.key(1))
@@ -31,7 +34,9 @@ def steps(stored: StoredPolicy) -> Transition:
         act = sampling_policy(networks, policy.params, policy.normalizer)
         return rollout(act, vector.step, vector.reset(key_reset), key_rollout, NUM_STEPS)[1]
 
-    return play(stored.policy)
+    transition = play(stored.policy)
+    counts = np.asarray(learned_from(transition, stored.policy.normalizer))[:, 0]
+    return jax.tree.map(lambda x: x[counts], transition)
 
 
 def rows(transition: Transition) -> np.ndarray:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+from typing import NamedTuple
 
 import jax
 import numpy as np
@@ -11,8 +12,21 @@ import envs
 from jaxpg.evaluation import evaluate
 from jaxpg.run.errors import UserError
 from jaxpg.run.policies import StoredPolicy
+from jaxpg.run.statistics import counted_returns
 
-Results = tuple[np.ndarray, dict[str, np.ndarray]]  # returns [N], metrics of the last step [N] by name
+
+class Results(NamedTuple):
+    """N episodes.
+
+    Attributes:
+      returns: at what they count (`counted_returns`), `[N]`.
+      diverged: whether the physics did, `[N]` of bool.
+      metrics: the environment's, of the last step, `[N]` by name.
+    """
+
+    returns: np.ndarray
+    diverged: np.ndarray
+    metrics: dict[str, np.ndarray]
 
 
 def play_own(stored: StoredPolicy, num_episodes: int, seed: int) -> Results:
@@ -23,9 +37,9 @@ def play_own(stored: StoredPolicy, num_episodes: int, seed: int) -> Results:
         act = functools.partial(stored.act, policy)
         return evaluate(stored.env, act, jax.random.split(key, num_episodes), stored.config.env.episode_length)
 
-    episodes = play(stored.policy, jax.random.key(seed))
-    metrics = {name: np.asarray(values) for name, values in episodes.metrics.items()}
-    return np.asarray(episodes.episode_return, np.float64), metrics
+    episodes = jax.tree.map(np.asarray, play(stored.policy, jax.random.key(seed)))
+    returns = counted_returns(episodes.episode_return, episodes.diverged)
+    return Results(returns, episodes.diverged, episodes.metrics)
 
 
 def play_gymnasium(stored: StoredPolicy, num_episodes: int, seed: int) -> Results:
@@ -50,4 +64,4 @@ def play_gymnasium(stored: StoredPolicy, num_episodes: int, seed: int) -> Result
         obs, reward, _, truncated, _ = pendulums.step(limit * np.asarray(act(stored.policy, obs)))
         returns += reward
     pendulums.close()
-    return returns, {}
+    return Results(returns, np.zeros(num_episodes, bool), {})

@@ -34,6 +34,8 @@ class StoredPolicy(NamedTuple):
       config: of the agent as a run of its own, with the changes.
       agent: in words, such as "seed 3".
       update: updates made when the checkpoint was written.
+      evaluated: whether it was chosen by a return; False for the best policy of a run none of whose evaluations gave
+        one, which is the untrained one.
     """
 
     act: Callable[[Policy, Any], Any]
@@ -44,6 +46,13 @@ class StoredPolicy(NamedTuple):
     config: Config
     agent: str
     update: int
+    evaluated: bool = True
+
+    def described(self, which: str) -> str:
+        """What it is and when it was saved, in words; `which` is how it was asked for, "best" or "last"."""
+        kind = which if self.evaluated else "untrained"
+        reason = "" if self.evaluated else "no evaluation gave a return to choose another by; "
+        return f"{kind} policy ({reason}saved after {self.update:,} updates)"
 
 
 def load(
@@ -91,7 +100,10 @@ def load_several(
         kind: (jax.tree.map(lambda x: np.asarray(x)[agent], policy), at) for kind, (policy, at) in found.items()
     }
     one = stored_policy(alone(config, agent), env, *of_agent["best"], described_agent(config, agent))
-    return [one._replace(policy=of_agent[kind][0], update=of_agent[kind][1]) for kind in kinds]
+    evaluated = {"best": bool(np.isfinite(best.episode_return[agent])), "last": True}
+    return [
+        one._replace(policy=of_agent[kind][0], update=of_agent[kind][1], evaluated=evaluated[kind]) for kind in kinds
+    ]
 
 
 def stored_policy(config: Config, env: Any, policy: Policy, update: int, agent: str) -> StoredPolicy:

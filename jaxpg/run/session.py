@@ -25,6 +25,7 @@ from jaxpg.run.program import Program, Schedule, compile_program, make_env, plan
 from jaxpg.run.runtime import StopRequests, prepare
 from jaxpg.run.schema import Run
 from jaxpg.run.state import Best, RunState, better, current_policy
+from jaxpg.run.statistics import counted_returns, finite_mean
 from jaxpg.run.terminal import Display, shown
 from jaxpg.run.watchdog import Watchdog
 from jaxpg.types import TrainState
@@ -294,11 +295,12 @@ def _draw(session: Session) -> list[dict[str, Any]]:
 def _evaluate(program: Program, state: RunState) -> tuple[RunState, dict[str, Any]]:
     """The deterministic policy's results, and the state with the best policy kept."""
     policy = current_policy(state.train)
-    episodes = program.evaluate(policy)
-    values = {"return": episodes.episode_return} | episodes.metrics
-    means = {name: np.asarray(value, np.float64).mean(axis=-1) for name, value in values.items()}
-    best = better(state.best, Best(policy, means["return"].astype(np.float32)))
-    return state._replace(best=best), {f"eval_{name}": jsonable(value) for name, value in means.items()}
+    episodes = jax.tree.map(np.asarray, program.evaluate(policy))
+    returns = counted_returns(episodes.episode_return, episodes.diverged).mean(axis=-1)
+    found = {name: finite_mean(value) for name, value in episodes.metrics.items()}
+    found |= {"return": returns, "diverged": episodes.diverged.sum(axis=-1)}
+    best = better(state.best, Best(policy, returns.astype(np.float32)))
+    return state._replace(best=best), {f"eval_{name}": jsonable(value) for name, value in found.items()}
 
 
 def is_solved(run: Run, best_returns: np.ndarray) -> bool:
@@ -314,10 +316,15 @@ def _closing_rows(
 ) -> dict[str, str]:
     evaluations = [line for line in lines if "eval_return" in line]
     last = evaluations[-1]
-    best = jsonable(results.best_returns(lines))
-    rows = {"deterministic return": f"{shown(last['eval_return'])} at the end, {shown(best)} at best"}
+    best = results.best_returns(lines)
+    rows = {"deterministic return": f"{shown(last['eval_return'])} at the end, {shown(jsonable(best))} at best"}
+    if not np.isfinite(best).all():
+        rows["best policy"] = "the untrained one: in every evaluation all episodes diverged"
+    exploded = np.sum(last.get("eval_diverged", 0))
+    if exploded:
+        rows["diverged"] = f"{exploded:,.0f} episodes of the last evaluation"
     if "eval_success" in last:
-        success = np.mean(last["eval_success"])
+        success = finite_mean(np.array(last["eval_success"], float))
         rows["success"] = f"{success:.1%} at the end"
     return rows | {
         "speed": f"{rate:,.0f} steps/s",

@@ -1,8 +1,45 @@
-"""Aggregates over seeds: the interquartile mean, the probability of improvement, and their bootstrap intervals."""
+"""Aggregates over episodes and over seeds: means, the interquartile mean, the probability of improvement, intervals."""
 
 from __future__ import annotations
 
 import numpy as np
+
+
+def counted_returns(episode_return: np.ndarray, diverged: np.ndarray) -> np.ndarray:
+    """Returns of an evaluation's episodes, with those whose physics diverged at what they count as.
+
+        R_i = min(0, min of R_j over the sound episodes j)    where episode i diverged
+
+    What such an episode earned is no measure: it ended early, which looks good where rewards are negative, and what it
+    earned on its way to infinity can have any size and sign. It counts as the worst of the others, and as 0 at best.
+
+    Args:
+      episode_return: of the episodes, `[..., N]`.
+      diverged: which of them did, `[..., N]` of bool.
+
+    Returns:
+      `[..., N]`, float64; NaN in all places that diverged where every episode of the row did.
+
+    >>> counted_returns(np.array([-3.0, -0.5, -7.0]), np.array([False, True, False])).tolist()
+    [-3.0, -7.0, -7.0]
+    """
+    returns, diverged = np.asarray(episode_return, float), np.asarray(diverged, bool)
+    worst = np.min(np.where(diverged, np.inf, returns), axis=-1, keepdims=True)
+    worst = np.where(diverged.all(axis=-1, keepdims=True), np.nan, np.minimum(worst, 0.0))
+    return np.where(diverged, worst, returns)
+
+
+def finite_mean(values: np.ndarray) -> np.ndarray:
+    """The mean of each row's finite numbers, `[..., N]` to `[...]`; NaN where it has none.
+
+    >>> finite_mean(np.array([[1.0, np.nan, 3.0], [np.inf, np.nan, np.nan]])).tolist()
+    [2.0, nan]
+    """
+    values = np.asarray(values, float)
+    finite = np.isfinite(values)
+    number = finite.sum(axis=-1)
+    total = np.where(finite, values, 0.0).sum(axis=-1)
+    return np.where(number > 0, total / np.maximum(number, 1), np.nan)
 
 
 def interquartile_mean(scores: np.ndarray) -> np.ndarray:

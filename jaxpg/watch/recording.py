@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
@@ -11,6 +12,7 @@ import numpy as np
 
 from envs.scenes import scene
 from jaxpg.deploy.controller import physical
+from jaxpg.evaluation import play
 from jaxpg.run.policies import StoredPolicy
 from jaxpg.run.program import RUN_ONCE
 from jaxpg.run.state import Policy
@@ -32,15 +34,16 @@ class Look(NamedTuple):
 
 
 class Recording(NamedTuple):
-    """N episodes of one policy, time first; what comes after an episode's end is to be left out.
+    """N episodes of one policy, time first; after an episode's end nothing moves and nothing is earned.
 
     Attributes:
       look: before each step and after the last one, `[T + 1, N, ...]`.
       command: in physical units, `[T, N, m]`.
       reward: `[T, N]`.
       value: V(s_t), the critic's guess of the discounted rewards to come, `[T, N]`.
-      length: steps until termination or the time limit, `[N]`.
-      metrics: the environment's, after each step, `[T, N]` by name.
+      length: steps until termination, divergence or the time limit, `[N]`.
+      metrics: the environment's, after each step the last that were finite, `[T, N]` by name.
+      diverged: whether the physics did, `[N]` of bool.
     """
 
     look: Look
@@ -49,6 +52,7 @@ class Recording(NamedTuple):
     value: np.ndarray
     length: np.ndarray
     metrics: Metrics
+    diverged: np.ndarray
 
     @property
     def episode_return(self) -> np.ndarray:
@@ -65,32 +69,24 @@ def record(stored: StoredPolicy, policies: Sequence[Policy], starts: jax.Array) 
       policies: all of the same network.
       starts: random keys that fix them, `[N]`.
     """
-    play = jax.jit(lambda policy: _play(stored, policy, starts)).lower(stored.policy).compile(RUN_ONCE)
-    return [jax.tree.map(np.asarray, play(policy)) for policy in policies]
+    played = jax.jit(lambda policy: _played(stored, policy, starts)).lower(stored.policy).compile(RUN_ONCE)
+    return [jax.tree.map(np.asarray, played(policy)) for policy in policies]
 
 
-def _play(stored: StoredPolicy, policy: Policy, starts: jax.Array) -> Recording:
+def _played(stored: StoredPolicy, policy: Policy, starts: jax.Array) -> Recording:
     env, look = stored.env, jax.vmap(looking(stored.env))
 
-    def step(state, _):
-        action = stored.act(policy, state.obs)
-        after = jax.vmap(env.step)(state, action)
-        return after, (
-            look(after),
-            physical(stored.interface, action),
-            after.reward,
-            stored.value(policy, state.obs),
-            after.done,
-            after.metrics,
-        )
+    def seen(step):
+        value = stored.value(policy, step.before.obs)
+        return look(step.after), physical(stored.interface, step.action), step.reward, value, step.metrics
 
-    first = jax.vmap(env.reset)(starts)
-    _, (seen, command, reward, values, done, metrics) = jax.lax.scan(
-        step, first, length=stored.config.env.episode_length
+    length = stored.config.env.episode_length
+    episodes, (after, command, reward, value, metrics) = play(
+        env, functools.partial(stored.act, policy), starts, length, seen
     )
-    seen = jax.tree.map(lambda x, rest: jnp.concatenate([x[None], rest]), look(first), seen)
-    ended = jnp.cumsum(done, axis=0) - done > 0
-    return Recording(seen, command, reward, values, jnp.sum(~ended, axis=0), metrics)
+    first = look(jax.vmap(env.reset)(starts))
+    looks = jax.tree.map(lambda x, rest: jnp.concatenate([x[None], rest]), first, after)
+    return Recording(looks, command, reward, value, episodes.length, metrics, episodes.diverged)
 
 
 def looking(env: Any):

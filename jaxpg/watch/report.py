@@ -15,6 +15,7 @@ from jaxpg.run.config import Config
 from jaxpg.run.folder import RunFolder
 from jaxpg.run.policies import StoredPolicy
 from jaxpg.run.program import SELECTION_SEED
+from jaxpg.run.statistics import counted_returns
 from jaxpg.run.terminal import shown
 from jaxpg.watch.curves import curves, finite
 from jaxpg.watch.page import page
@@ -40,8 +41,10 @@ def of_run(path: str, agent: int | None, cache: bool, say: Callable[[str], None]
     run_folder = folder.find(path)
     with physics_cache(cache), compilation_cache(cache, say):
         best, last = policies.load_several(path, ["best", "last"], agent)
-        stages = {"before training": policies.untrained(best), "best": best}
-        if last.update != best.update:
+        stages = {"before training": policies.untrained(best)}
+        if best.evaluated:
+            stages["best"] = best
+        if last.update != best.update or not best.evaluated:
             stages["last"] = last
         content = page(report(run_folder, configuration.load(run_folder.config), stages))
     folder.replace(run_folder.report, content)
@@ -89,9 +92,10 @@ def _returns(stages: Mapping[str, StoredPolicy], recordings: Sequence[Recording]
     """Of each policy, over all of its episodes."""
     rows = []
     for label, recording in zip(stages, recordings, strict=True):
-        returns = recording.episode_return
+        returns = counted_returns(recording.episode_return, recording.diverged)
         error = returns.std(ddof=1) / math.sqrt(len(returns)) if len(returns) > 1 else math.nan
-        rows.append([f"return, {label}", f"{returns.mean():.1f} ± {error:.1f} over {len(returns)} episodes"])
+        exploded = f", {recording.diverged.sum()} of which diverged" if recording.diverged.any() else ""
+        rows.append([f"return, {label}", f"{returns.mean():.1f} ± {error:.1f} over {len(returns)} episodes{exploded}"])
     return rows
 
 

@@ -53,7 +53,7 @@ def render(options: RenderOptions, changes: Mapping[str, Any], say: Callable[[st
     movie.write(out, images(stored, clips, every, (options.width, options.height), backend), seconds)
     number = len(shown(clips, every))
     returns = " ".join(f"{one.episode_return:.1f}" for one in clips)
-    say(f"{described(stored.config)}, {options.checkpoint} policy (saved after {stored.update:,} updates)")
+    say(f"{described(stored.config)}, {stored.described(options.checkpoint)}")
     say(f"returns  {returns}")
     say(f"{out}  {number} pictures, {float(number * seconds):.2f} s at {float(1 / seconds):.4g} a second")
 
