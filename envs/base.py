@@ -16,6 +16,7 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from flax import struct
 
 from envs.physics import check_once, compile_model, compile_step
@@ -61,9 +62,14 @@ class Interface(NamedTuple):
 
 
 def interface(env: Any) -> Interface:
-    """The environment's own, or numbers without names or limits where it has none, as brax's have not."""
+    """The environment's own, in plain names and numbers; names alone where it has none, as brax's have not.
+
+    An environment may say its names and limits as any sequences, such as NumPy's or JAX's arrays.
+    """
     if hasattr(env, "interface"):
-        return env.interface
+        observations, commands, limits = env.interface
+        limits = None if limits is None else tuple(np.asarray(limits, float).ravel().tolist())
+        return Interface(tuple(observations), tuple(commands), limits)
     names, commands = (
         tuple(f"{name}_{i}" for i in range(size))
         for name, size in (("observation", env.observation_size), ("action", env.action_size))

@@ -27,6 +27,7 @@ from gymnasium.vector import AutoresetMode
 from gymnasium.vector.utils import batch_space
 
 import envs
+from envs.base import interface
 from envs.options import OptionError, build
 
 
@@ -197,7 +198,7 @@ def spaces(env: Any, bounds: Sequence[float] | None) -> tuple[Box, Box]:
 
 def command_limits(env: Any) -> np.ndarray:
     """The command at action 1 of each `[m]`: 1 where the environment does not say, infinity where there is no limit."""
-    limits = env.interface.limits if hasattr(env, "interface") else [1.0] * env.action_size
+    limits = interface(env).limits if hasattr(env, "interface") else [1.0] * env.action_size
     return np.array([np.inf] * env.action_size if limits is None else limits, np.float32)
 
 
@@ -240,7 +241,7 @@ def _built(name: str, render_mode: str | None, options: dict[str, Any]) -> tuple
 @functools.lru_cache(maxsize=8)
 def _shared(name: str, config: Any) -> Any:
     """One environment for all that ask for the same options, so that its functions are compiled once."""
-    return envs.find(name).build(config)
+    return envs.of_config(name, config)
 
 
 # What is known of the magnitude of the observations, by the environment's name: cosines and sines, and clipped speeds.

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+import envs
 from jaxpg.run import config, help
+from jaxpg.run.commands import check_named
 from jaxpg.run.errors import run_command
 
 
@@ -15,12 +17,16 @@ def main(arguments: Sequence[str]) -> int:
         return 0
     from jaxpg.run import session
 
+    check_named("resume", arguments)
     given = config.parse(arguments)
     if given.get("resume") == "auto":
         return session.begin_or_resume(config.compose([text for text in arguments if text != "resume=auto"]))
     if "resume" in given:
         return session.resume(given)
-    return session.begin(config.compose(arguments))
+    asked = config.compose(arguments)
+    if asked.choices["algo"] not in envs.find(asked.choices["env"]).training:
+        print(f"env={asked.choices['env']} has no training values for algo={asked.choices['algo']}: the defaults count")
+    return session.begin(asked)
 
 
 if __name__ == "__main__":

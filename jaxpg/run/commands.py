@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from pathlib import Path
 from typing import Any
 
 from envs.options import build
@@ -37,6 +38,7 @@ def about_a_run(command: str, schema: type, arguments: Sequence[str]) -> Any:
     """
     if asks_for_help(command, "run=DIR", schema, arguments):
         return None
+    check_named("run", arguments)
     options = build(schema, config.parse(arguments))
     if options.run is None:
         raise UserError("run=DIR is missing: the folder of a run, such as runs/pendulum")
@@ -48,3 +50,10 @@ def about_a_run_in(command: str, schema: type, arguments: Sequence[str]) -> tupl
     of_env = [argument for argument in arguments if argument.startswith("env.")]
     options = about_a_run(command, schema, [argument for argument in arguments if argument not in of_env])
     return options, config.parse(of_env)
+
+
+def check_named(option: str, arguments: Sequence[str]) -> None:
+    """Raises UserError where a run's folder is given without the name of its option, as `python -m jaxpg.compare` has it."""
+    for argument in arguments:
+        if "=" not in argument and not argument.startswith("-") and ("/" in argument or Path(argument).is_dir()):
+            raise UserError(f"'{argument}': expected {option}={argument}")

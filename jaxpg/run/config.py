@@ -1,9 +1,10 @@
-"""What a training run is told: typed options in groups, composed by Hydra, checked here.
+"""What a training run is told: typed options in groups, composed and checked here.
 
-The command line is Hydra's: `env=arm algo=td algo.lambda_=0.9 seed=3`. Hydra composes the groups and reads the values;
-names, types and ranges come from dataclasses of `envs.options.option` fields, so that every mistake is reported at once
-and in the user's words. Values that nobody gave come from the environment's registry entry, which keeps what was tuned
-on it, and else from the dataclasses.
+The command line is in Hydra's grammar: `env=arm algo=td algo.lambda_=0.9 seed=3`. Names, types and ranges come from
+dataclasses of `envs.options.option` fields, so that every mistake is reported at once and in the user's words. Values
+that nobody gave come from the environment's registry entry, which keeps what was tuned on it, and else from the
+dataclasses. Hydra reads values and nothing more: a program that runs under Hydra itself has its state to itself, and
+what a user writes stands as it is written, `${...}` too.
 """
 
 from __future__ import annotations
@@ -17,6 +18,7 @@ from typing import Any
 
 import envs
 from envs.options import OptionError, build, unknown
+from jaxpg.run import plain_yaml, registered
 from jaxpg.run import sweep as sweeping
 from jaxpg.run.errors import UserError
 from jaxpg.run.schema import GROUPS, LARGEST, Gaussian, Run, option_fields
@@ -24,6 +26,7 @@ from jaxpg.run.schema import GROUPS, LARGEST, Gaussian, Run, option_fields
 DEFAULT_CHOICES = {"env": "pendulum", "algo": "td", "network": "mlp"}  # algo: the first that the environment has tuned
 FOLDERS = ("run_dir", "resume", "run", "out")  # options whose value is a path
 DEFAULT_ROLLOUT = 16  # steps of a TD rollout where neither the user nor the environment says
+LIBRARIES = ("brax", "playground")  # whose environments have names of their own, as the option `name`
 
 
 @dataclass(frozen=True)
@@ -47,7 +50,7 @@ class Config:
     @property
     def task(self) -> str:
         """The environment's name; of another library's, the name that it has there."""
-        return getattr(self.env, "name", self.choices["env"])
+        return self.env.name if self.choices["env"] in LIBRARIES else self.choices["env"]
 
     @property
     def num_shards(self) -> int:
@@ -101,7 +104,7 @@ def _complete(config: Config) -> Config:
     problems = [*_conflicts_of_the_algorithm(config), *_conflicts_of_the_network(config), *_conflicts_of_agents(config)]
     default = config.env.episode_length if config.choices["algo"] == "reinforce" else DEFAULT_ROLLOUT
     config = dataclasses.replace(config, run=dataclasses.replace(config.run, num_steps=config.run.num_steps or default))
-    problems += _conflicts_of_sizes(config.run, config.env.episode_length)
+    problems += _conflicts_of_sizes(config.run, config.algo, config.env.episode_length)
     if problems:
         raise OptionError(problems)
     return config
@@ -150,16 +153,19 @@ def _conflicts_of_agents(config: Config) -> Iterator[str]:
         yield f"seed={run.seed} num_seeds={run.num_seeds}: seeds must stay below 2**32"
 
 
-def _conflicts_of_sizes(run: Run, horizon: int) -> Iterator[str]:
+def _conflicts_of_sizes(run: Run, algo: Any, horizon: int) -> Iterator[str]:
     """XLA's indices and the counters of steps and updates are 32-bit numbers."""
-    if horizon >= 2**31:
-        yield f"env.episode_length={horizon}: it must stay below 2**31"
+    if not 1 <= horizon < 2**31:
+        yield f"env.episode_length={horizon}: it must be at least 1 and stay below 2**31"
     rollout = run.num_envs * run.num_steps
     if rollout >= 2**31:
         yield f"num_envs={run.num_envs} num_steps={run.num_steps}: their product must stay below 2**31"
-    elif run.total_steps // rollout >= 2**31 - 1:
-        most = rollout * (2**31 - 1)
-        yield f"total_steps={run.total_steps}: with {rollout} steps an update it must stay below {most}"
+        return
+    of_update = getattr(algo, "epochs", 1) * getattr(algo, "minibatches", 1)
+    most = rollout * ((2**31 - 1) // of_update)
+    if run.total_steps >= most:
+        gradients = f" and {of_update} gradient steps" if of_update > 1 else ""
+        yield f"total_steps={run.total_steps}: with {rollout} steps{gradients} an update it must stay below {most}"
 
 
 def _nearest_divisor(number: int, to: int) -> int:
@@ -171,10 +177,11 @@ def compose(arguments: Sequence[str]) -> Config:
     """The configuration that a command line asks for.
 
     Args:
-      arguments: Hydra overrides, `name=value`.
+      arguments: overrides in Hydra's grammar, `name=value`.
 
     Raises:
-      OptionError, UserError: every unknown name, wrong type and value out of range; or text that is no override.
+      OptionError, UserError: every unknown name, wrong type and value out of range, of the command line or of the
+        environment's training values; or text that is no override.
     """
     given = parse(arguments)
     _check_choices(_members(given))
@@ -185,8 +192,7 @@ def compose(arguments: Sequence[str]) -> Config:
     problems = _unknown_names(plain, choices)
     problems += [f"{name} is given and swept: leave out one of them" for name in plain if name in swept]
     values = {name: value for name, value in tuned.items() if name in _tunable(tuned, choices)} | plain
-    values = {name: value for name, value in values.items() if name in option_fields(choices)}
-    return from_dict({**_hydra_compose(choices, values), "sweep": swept}, problems)
+    return from_dict({**_with_defaults(choices, values), "sweep": swept}, problems)
 
 
 def _members(values: Mapping[str, Any]) -> dict[str, Any]:
@@ -203,11 +209,10 @@ def _divide(values: Mapping[str, Any]) -> tuple[dict[str, Any], dict[str, Any]]:
 
 def _tuned(chosen: Mapping[str, Any]) -> Mapping[str, Any]:
     """What the environment's registry entry says: its algorithm where none was chosen, and that one's values."""
-    entry = envs.REGISTRY.get(chosen.get("env", DEFAULT_CHOICES["env"]))
-    if entry is None:
-        return {}
-    algo = chosen.get("algo", next(iter(entry.training)))
-    return {"algo": algo, **entry.training.get(algo, {})}
+    name = chosen.get("env", DEFAULT_CHOICES["env"])
+    training = registered.training_values(name)
+    algo = chosen.get("algo", next(iter(training), DEFAULT_CHOICES["algo"]))
+    return {"algo": algo, **training.get(algo, {})}
 
 
 def _tunable(tuned: Mapping[str, Any], choices: Mapping[str, str]) -> set[str]:
@@ -271,7 +276,8 @@ def _plain(value: Any) -> Any:
     """Hydra's quoted strings as str, also inside lists."""
     if isinstance(value, list):
         return [_plain(element) for element in value]
-    return value if isinstance(value, (bool, int, float)) or value is None else str(getattr(value, "text", value))
+    is_plain = isinstance(value, (bool, int, float, dict)) or value is None
+    return value if is_plain else str(getattr(value, "text", value))
 
 
 def _check_choices(choices: Mapping[str, Any]) -> None:
@@ -279,46 +285,32 @@ def _check_choices(choices: Mapping[str, Any]) -> None:
     problems = [unknown(group, name, GROUPS[group]) for group, name in names.items() if name not in GROUPS[group]]
     if problems:
         raise OptionError(problems)
+    if "env" in names:
+        envs.find(names["env"])
 
 
 def _unknown_names(given: Mapping[str, Any], choices: Mapping[str, Any]) -> list[str]:
     """A line for each name that is no option and no group."""
-    problems = []
-    known = set(option_fields(choices)) | set(GROUPS)
-    leaves = {name.rsplit(".", 1)[-1]: name for name in known}
-    for name in given:
-        if name not in known:
-            same_leaf = leaves.get(name.rsplit(".", 1)[-1])
-            problems.append(
-                f"unknown option '{name}': did you mean '{same_leaf}'?" if same_leaf else unknown("option", name, known)
-            )
-    return problems
+    known = {*option_fields(choices), *GROUPS}
+    return [unknown("option", name, known) for name in given if name not in known]
 
 
-def _hydra_compose(choices: Mapping[str, str], values: Mapping[str, Any]) -> dict[str, Any]:
-    """Hydra's composition of the groups' defaults and of `values`, as plain nested values."""
-    import hydra
-    from hydra.core.config_store import ConfigStore
-    from omegaconf import OmegaConf
-
-    store = ConfigStore.instance()
-    for group, members in GROUPS.items():
-        for name, schema in members.items():
-            store.store(name=name, group=group, node={"id": name, **dataclasses.asdict(schema())})
-    defaults = [{group: choice} for group, choice in DEFAULT_CHOICES.items()]
-    store.store(name="config", node={"defaults": [*defaults, "_self_"], **dataclasses.asdict(Run())})
-    with hydra.initialize(version_base=None, config_path=None):
-        composed = hydra.compose("config", [f"{group}={choice}" for group, choice in choices.items()])
-    for name, value in values.items():
-        OmegaConf.update(composed, name, value)
-    return OmegaConf.to_container(composed, resolve=True)
+def _with_defaults(choices: Mapping[str, str], values: Mapping[str, Any]) -> dict[str, Any]:
+    """The groups' members and the run's own options with their defaults, but for the values given, nested."""
+    members = {group: {"id": name, **dataclasses.asdict(GROUPS[group][name]())} for group, name in choices.items()}
+    nested = {**dataclasses.asdict(Run()), **members}
+    for name in option_fields(choices).keys() & values.keys():
+        group, _, leaf = name.rpartition(".")
+        (nested[group] if group else nested)[leaf] = values[name]
+    return nested
 
 
 def to_yaml(config: Config) -> str:
-    """The content of `config.yaml`; `load` reads it."""
-    from omegaconf import OmegaConf
+    """The content of `config.yaml`; `load` reads it.
 
-    return OmegaConf.to_yaml(OmegaConf.create(config.to_dict()))
+    Of an environment of somebody's own it says too which program registered it.
+    """
+    return plain_yaml.dump(registered.program_of(config.choices["env"]) | config.to_dict())
 
 
 def load(path: Path) -> Config:
@@ -327,13 +319,13 @@ def load(path: Path) -> Config:
     Raises:
       UserError: the file cannot be read; OptionError: a name, type or range in it is wrong.
     """
-    from omegaconf import OmegaConf
-
     try:
-        return from_dict(OmegaConf.to_container(OmegaConf.load(path)))
-    except OptionError:
+        values = plain_yaml.load(path)
+        registered.check_known(values["env"]["id"], values.pop(registered.PROGRAM, None))
+        return from_dict(values)
+    except (OptionError, UserError):
         raise
-    except Exception as error:  # YAML and OmegaConf raise many kinds; whichever it is, the file is not ours
+    except Exception as error:  # YAML raises many kinds, and what it reads may be anything; it is not ours
         raise UserError(f"{path}: not a configuration of a run ({' '.join(str(error).split())})") from error
 
 

@@ -2,15 +2,23 @@
 
 from __future__ import annotations
 
+import errno
 import gc
 import os
 import sys
+import threading
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, redirect_stderr, redirect_stdout
 from typing import Any, TextIO
 
 from envs.options import OptionError
 from envs.physics import MujocoModelError
+from jaxpg.run.signals import Interrupts
+
+INTERRUPTED = 130  # the exit status, as shells have it
+# What is wrong with a file or a folder of the user's; other OSErrors are mistakes of ours.
+SURROUNDINGS = (errno.EACCES, errno.EPERM, errno.EROFS, errno.ENAMETOOLONG, errno.ELOOP, errno.ENOTDIR, errno.EISDIR)
+SURROUNDINGS += (errno.ENOSPC, errno.EDQUOT, errno.EIO)
 
 
 class UserError(Exception):
@@ -19,16 +27,24 @@ class UserError(Exception):
 
 def run_command(main: Callable[[Sequence[str]], int | None]) -> None:
     """`sys.exit(main(arguments))`, where a user's mistake ends in its message and status 2."""
+    interrupted = False
     with _unbreakable_output():
         try:
-            status = main(sys.argv[1:])
+            with Interrupts():
+                status = main(sys.argv[1:])
         except OptionError as error:
             status = _report(error.problems)
         except (UserError, MujocoModelError) as error:
             status = _report([str(error)])
+        except OSError as error:
+            if error.filename is None or error.errno not in SURROUNDINGS:
+                raise
+            status = _report([f"{os.fsdecode(error.filename)}: {error.strerror}"])
         except KeyboardInterrupt:
             print("interrupted", file=sys.stderr)
-            status = 130
+            status, interrupted = INTERRUPTED, True
+    if interrupted and threading.active_count() > 1:
+        os._exit(status)  # XLA, which compiles there, cannot be interrupted, and Python would wait for its threads
     gc.freeze()  # the interpreter's last collections would look through all that jax has made: half a second
     sys.exit(status)
 

@@ -18,9 +18,11 @@ from __future__ import annotations
 import contextlib
 import errno
 import importlib.metadata
+import itertools
 import json
 import os
 import platform
+import re
 import time
 from collections.abc import Callable, Iterator, Sequence
 from functools import partial
@@ -38,6 +40,7 @@ from jaxpg.run.loggers import UntilItFails, values_of
 from jaxpg.run.loggers.follower import Follower
 from jaxpg.run.loggers.tensorboard import TensorBoard
 
+LONGEST_TASK = 100  # letters of the task's name in a folder's: file systems take 255 bytes
 RECORDED_PACKAGES = ("jax", "jaxlib", "mujoco", "mujoco-mjx", "brax", "flax", "optax", "orbax-checkpoint", "numpy")
 
 
@@ -58,7 +61,7 @@ class RunFolder:
 
 
 def planned(config: Config) -> RunFolder:
-    """The run folder asked for, or `runs/<env>-<algo>-s<seed>-<time>`; nothing is made yet.
+    """The run folder asked for, of which nothing is made yet; or else `runs/<env>-<algo>-s<seed>-<time>`, which is.
 
     Raises:
       UserError: it has a name that orbax takes for a pattern.
@@ -67,11 +70,23 @@ def planned(config: Config) -> RunFolder:
     if run.run_dir is not None:
         folder = RunFolder(run.run_dir)
     else:
+        task = re.sub(r"[^\w.-]", "_", config.task)[:LONGEST_TASK].lstrip(".-")
         stamp = time.strftime("%Y%m%d-%H%M%S")
-        folder = RunFolder(Path("runs") / f"{config.task}-{config.choices['algo']}-s{run.seed}-{stamp}")
+        folder = RunFolder(_made(Path("runs") / f"{task}-{config.choices['algo']}-s{run.seed}-{stamp}"))
     if set("[]") & set(str(folder.path.resolve())):
         raise UserError(f"{folder.path}: checkpoints cannot be kept below a folder with [ or ] in its name")
     return folder
+
+
+def _made(path: Path) -> Path:
+    """A new folder of that name, or of one with a number after it: runs that begin in the same second have their own."""
+    with _reported(path):
+        path.parent.mkdir(parents=True, exist_ok=True)
+        for number in itertools.count(1):
+            folder = path if number == 1 else path.with_name(f"{path.name}-{number}")
+            with contextlib.suppress(FileExistsError):
+                folder.mkdir()
+                return folder
 
 
 def check_empty(folder: RunFolder) -> None:

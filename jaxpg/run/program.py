@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import functools
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any, NamedTuple
 
@@ -104,7 +105,7 @@ def plan(config: Config, done: int = 0) -> Schedule:
 
 def make_env(config: Config) -> Any:
     """The environment; raises OptionError where it has a mistake to report, or where the features do not fit it."""
-    env = envs.REGISTRY[config.choices["env"]].build(config.env)
+    env = envs.of_config(config.choices["env"], config.env)
     _check_features(config.network, env.observation_size)
     return env
 
@@ -265,7 +266,7 @@ def compile_program(
     of_group = jax.tree.map(lambda x: x[: run.vmap_seeds], agents)
     init = jax.jit(init).trace(of_group)
     shape = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype), init.out_info)
-    with ThreadPoolExecutor() as pool:
+    with _compilers() as pool:
         # Tracing holds Python's lock and compiling does not: one trace after the other, that of the longest compilation
         # first, so that no compilation waits for another one's trace.
         advance = pool.submit(jax.jit(advance).lower(of_group, shape.train).compile, OPTIMIZED)
@@ -282,6 +283,16 @@ def compile_program(
         play,
         jax.tree.map(lambda x: jax.ShapeDtypeStruct((len(agents.seed), *x.shape[1:]), x.dtype), shape),
     )
+
+
+@contextlib.contextmanager
+def _compilers() -> Iterator[ThreadPoolExecutor]:
+    """Threads to compile in, for which an exception does not wait: XLA cannot be interrupted."""
+    pool = ThreadPoolExecutor()
+    try:
+        yield pool
+    finally:
+        pool.shutdown(wait=False)
 
 
 def initial_run(algorithm: Algorithm, seed: jax.Array) -> RunState:

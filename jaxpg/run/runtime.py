@@ -1,23 +1,19 @@
-"""What has to be settled before JAX starts its backend, and requests to stop while it computes."""
+"""What has to be settled before JAX starts its backend."""
 
 from __future__ import annotations
 
 import contextlib
 import os
-import signal
 import subprocess
 import sys
-from types import FrameType
 
 import jax
 import jaxlib
 
 from jaxpg.compatibility import may_deadlock
-from jaxpg.run.config import Config
+from jaxpg.run.config import LIBRARIES, Config
 from jaxpg.run.errors import UserError
 from jaxpg.run.folder import num_threads
-
-MAY_CALL_LAPACK = ("brax", "playground")
 
 
 def prepare(config: Config, threads: int | None = None) -> None:
@@ -31,7 +27,7 @@ def prepare(config: Config, threads: int | None = None) -> None:
       UserError: the process's environment asks JAX for something that cannot be trained with.
     """
     _check_variables()
-    if threads is None and config.choices["env"] in MAY_CALL_LAPACK and may_deadlock(jaxlib.__version__):
+    if threads is None and config.choices["env"] in LIBRARIES and may_deadlock(jaxlib.__version__):
         threads = 1
     os.environ["PJRT_NPROC"] = str(threads or num_threads())
     with contextlib.suppress(RuntimeError):  # where the process has computed something already, with what it has
@@ -59,27 +55,3 @@ def _check_variables() -> None:
             lines = [line for line in ended.stderr.splitlines() if "flag" in line.lower()]
             reason = lines[0].rpartition("] ")[2] if lines else f"status {ended.returncode}"
             raise UserError(f"XLA_FLAGS={flags}: XLA does not start with it ({reason})")
-
-
-class StopRequests:
-    """SIGINT, SIGTERM and SIGHUP as a request to stop at the next occasion; a second SIGINT stops at once.
-
-    As a context manager; `signal` is the signal that came, or None. What the process was told to ignore, as `nohup`
-    does with SIGHUP, stays ignored.
-    """
-
-    HANDLED = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
-
-    def __enter__(self) -> StopRequests:
-        self.signal: signal.Signals | None = None
-        heard = [number for number in self.HANDLED if signal.getsignal(number) is not signal.SIG_IGN]
-        self._before = {number: signal.signal(number, self._note) for number in heard}
-        return self
-
-    def __exit__(self, *exception: object) -> None:
-        for number, handler in self._before.items():
-            signal.signal(number, handler)
-
-    def _note(self, number: int, frame: FrameType | None) -> None:
-        self.signal = signal.Signals(number)
-        signal.signal(signal.SIGINT, signal.default_int_handler)

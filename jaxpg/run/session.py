@@ -22,8 +22,9 @@ from jaxpg.run.folder import MetricsLog, RunFolder, jsonable
 from jaxpg.run.keeper import Keeper
 from jaxpg.run.loggers import follower
 from jaxpg.run.program import Program, Schedule, compile_program, make_env, plan
-from jaxpg.run.runtime import StopRequests, prepare
+from jaxpg.run.runtime import prepare
 from jaxpg.run.schema import Run
+from jaxpg.run.signals import StopRequests
 from jaxpg.run.state import Best, RunState, better, current_policy
 from jaxpg.run.statistics import counted_returns, finite_mean
 from jaxpg.run.terminal import Display, shown
