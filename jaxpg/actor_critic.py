@@ -173,7 +173,7 @@ def actor_critic(
         key_rollout = collectives.own(key_rollout, axis_name)
         env_state, transition = method.collect(env, policy_fn, state.env_state, key_rollout)
         batch = prepare(state.params, state.normalizer, transition)
-        params, opt_state, metrics = learn(state.params, state.opt_state, batch, key_learn)
+        params, opt_state, metrics = learn(state.params, state.opt_state, batch, key_learn, state.update)
         normalizer = state.normalizer
         if normalize_observations:
             normalizer = normalization.update(normalizer, transition.obs, axis_name)
