@@ -179,7 +179,7 @@ def actor_critic(
         statistics = normalization.update(state.normalizer, transition.obs, axis_name, sound)
         counts = learned_from(transition, statistics)
         batch = prepare(state.params, state.normalizer, transition, counts)
-        learned = learn(state.params, state.opt_state, batch, key_learn)
+        learned = learn(state.params, state.opt_state, batch, key_learn, state.update)
         something = collectives.largest(jnp.max(batch.weight), axis_name) > 0
         params, opt_state = select(something, learned[:2], (state.params, state.opt_state))
         normalizer = statistics if normalize_observations else state.normalizer

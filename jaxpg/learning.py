@@ -65,6 +65,11 @@ class Reuse(NamedTuple):
     value_clip: float | None = None
     max_kl: float | None = None
 
+    @property
+    def steps(self) -> int:
+        """Gradient steps on one rollout, as far as `max_kl` lets them."""
+        return self.epochs * self.minibatches
+
 
 def actor_critic_loss(
     networks: Networks, entropy_coef: float, reuse: Reuse | None = None
@@ -107,8 +112,8 @@ def actor_critic_loss(
     return loss
 
 
-# learn(params, opt_state, batch, key) -> (params, opt_state, metrics)
-Learn = Callable[[PyTree, PyTree, Batch, jax.Array], tuple[PyTree, PyTree, Metrics]]
+# learn(params, opt_state, batch, key, update) -> (params, opt_state, metrics)
+Learn = Callable[[PyTree, PyTree, Batch, jax.Array, jax.Array | int], tuple[PyTree, PyTree, Metrics]]
 
 
 def one_step(loss: Callable, optimizer: optax.GradientTransformation, axis_name: str | None = None) -> Learn:
@@ -116,13 +121,15 @@ def one_step(loss: Callable, optimizer: optax.GradientTransformation, axis_name:
 
     Args:
       loss: `loss(params, batch) -> (L, metrics)`.
-      optimizer: of the parameters.
+      optimizer: of the parameters; one that takes further arguments, as `scale_by_progress` does, is told how far the
+        training is.
       axis_name: a mapped axis, along which there are further parts of the batch.
     """
+    optimizer = optax.with_extra_args_support(optimizer)
 
-    def learn(params, opt_state, batch, key=None):
+    def learn(params, opt_state, batch, key=None, update=0):
         gradients, metrics = collectives.mean(jax.grad(loss, has_aux=True)(params, batch), axis_name)
-        updates, opt_state = optimizer.update(gradients, opt_state, params)
+        updates, opt_state = optimizer.update(gradients, opt_state, params, progress=update)
         metrics = metrics | {"gradient_norm": optax.tree.norm(gradients)}
         return optax.apply_updates(params, updates), opt_state, metrics
 
@@ -135,14 +142,14 @@ def several_steps(
     """`reuse.epochs` passes over the batch in `reuse.minibatches` parts; metrics are means over the steps taken."""
     once = one_step(loss, optimizer, axis_name)
 
-    def take(carry, part):
-        params, opt_state, near = carry
-        params, opt_state, metrics = once(params, opt_state, part)
+    def take(carry, numbered_part):
+        (params, opt_state, near), (number, part) = carry, numbered_part
+        params, opt_state, metrics = once(params, opt_state, part, update=number)
         return (params, opt_state, near), metrics | {"gradient_steps": jnp.ones(())}
 
-    def take_while_near(carry, part):
+    def take_while_near(carry, numbered_part):
         def attempt():
-            (params, opt_state, _), metrics = take(carry, part)
+            (params, opt_state, _), metrics = take(carry, numbered_part)
             near = metrics["kl"] <= reuse.max_kl  # of the parameters before the step
             taken = jax.tree.map(lambda new, old: jnp.where(near, new, old), (params, opt_state), carry[:2])
             return (*taken, near), jax.tree.map(lambda x: near * x, metrics)
@@ -152,17 +159,42 @@ def several_steps(
 
     step = take if reuse.max_kl is None else take_while_near
 
-    def learn(params, opt_state, batch, key):
-        def epoch(carry, key):
-            return jax.lax.scan(step, carry, shuffled_parts(batch, key, reuse.minibatches))
+    def learn(params, opt_state, batch, key, update=0):
+        def epoch(carry, numbers_and_key):
+            numbers, key = numbers_and_key
+            return jax.lax.scan(step, carry, (numbers, shuffled_parts(batch, key, reuse.minibatches)))
 
         carry = params, opt_state, jnp.array(True)
-        (params, opt_state, _), metrics = jax.lax.scan(epoch, carry, jax.random.split(key, reuse.epochs))
+        numbers = jnp.arange(reuse.steps, dtype=jnp.int32).reshape(reuse.epochs, reuse.minibatches)
+        keys = jax.random.split(key, reuse.epochs)
+        (params, opt_state, _), metrics = jax.lax.scan(epoch, carry, (update * reuse.steps + numbers, keys))
         steps = jnp.sum(metrics["gradient_steps"])
         metrics = {name: jnp.sum(x) / jnp.maximum(steps, 1) for name, x in metrics.items()}
         return params, opt_state, metrics | {"gradient_steps": steps}
 
     return learn
+
+
+def scale_by_progress(schedule: optax.Schedule) -> optax.GradientTransformationExtraArgs:
+    """Gradients times `schedule(progress)`, the last part of an optimizer whose step size changes.
+
+    `optax.scale_by_schedule` counts the steps that it has taken. Here the step size belongs to a point of the training
+    and not to its history: steps that were left out, as beyond `Reuse.max_kl`, are counted as if they had been taken.
+
+    Args:
+      schedule: of the gradient steps that the training had room for before this one: with u updates made and K steps in
+        each, u K and those before it in its own.
+    """
+
+    def init(params):
+        return optax.ScaleByScheduleState(count=jnp.zeros((), jnp.int32))
+
+    def update(gradients, state, params=None, *, progress, **others):
+        factor = schedule(progress)
+        scaled = jax.tree.map(lambda g: jnp.asarray(factor, g.dtype) * g, gradients)
+        return scaled, optax.ScaleByScheduleState(count=jnp.asarray(progress, jnp.int32) + 1)
+
+    return optax.GradientTransformationExtraArgs(init, update)
 
 
 def shuffled_parts(batch: PyTree, key: jax.Array, number: int) -> PyTree:

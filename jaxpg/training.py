@@ -1,8 +1,9 @@
-"""The training: one `lax.scan` over the updates."""
+"""The training: one loop over the updates, inside the compiled program."""
 
 from __future__ import annotations
 
 import jax
+import jax.numpy as jnp
 
 from jaxpg.types import Algorithm, Metrics, TrainState
 
@@ -33,6 +34,38 @@ def train_scan(
         return algorithm.step(state, jax.random.fold_in(key, state.update + 1))
 
     return jax.lax.scan(update, state, length=num_updates)
+
+
+def train_chunk(
+    algorithm: Algorithm, key: jax.Array, length: int, num_updates: jax.Array | int, state: TrainState
+) -> tuple[TrainState, Metrics]:
+    """The first `num_updates` of `length` updates: `train_scan` with a number that is known only when it runs.
+
+    One compiled program makes all parts of a run, the last of which may be shorter.
+
+    Args:
+      algorithm, key: as in `train_scan`.
+      length: room for the metrics of as many updates.
+      num_updates: how many updates to make, from 0 to `length`; the same for all that are mapped over, so that
+        `jax.vmap` branches instead of selecting.
+      state: where to go on.
+
+    Returns:
+      The state after these updates, and their metrics, `[length]` by name; those of updates not made are 0.
+    """
+
+    def update(state):
+        return algorithm.step(state, jax.random.fold_in(key, state.update + 1))
+
+    def one(i, carry):
+        state, rows = carry
+        state, metrics = update(state)
+        rows = jax.tree.map(lambda row, x: jax.lax.dynamic_update_index_in_dim(row, x, i, 0), rows, metrics)
+        return state, rows
+
+    of_one = jax.eval_shape(update, state)[1]
+    rows = jax.tree.map(lambda x: jnp.zeros((length, *x.shape), x.dtype), of_one)
+    return jax.lax.fori_loop(0, num_updates, one, (state, rows))
 
 
 def initial_state(algorithm: Algorithm, key: jax.Array) -> TrainState:

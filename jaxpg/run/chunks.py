@@ -14,6 +14,7 @@ from jaxpg.soundness import FLAGS, quantities
 from jaxpg.types import Metrics, TrainState
 
 NO_MEASUREMENTS = (*FLAGS, "diverged_env")
+PATIENCE = 100  # updates in a row that could not be applied, after which a run that leaves such out gives up
 
 
 def summary(metrics: Metrics) -> dict[str, Any]:
@@ -42,24 +43,47 @@ def _mean(values: np.ndarray) -> np.ndarray:
     return np.where(number > 0, np.nansum(values, axis=-1) / np.maximum(number, 1), np.nan)
 
 
+def _at_the_end(flags: np.ndarray) -> np.ndarray:
+    """How many of each row's last entries are true in a row.
+
+    >>> _at_the_end(np.array([[True, False, True, True], [True, True, False, False]])).tolist()
+    [2, 0]
+    """
+    return np.cumprod(flags[:, ::-1], axis=-1).sum(axis=-1)
+
+
 class Watch:
     """Says what was not finite, once for each agent, and knows who stands still since then.
+
+    An agent that stops before an unsound update makes the same one again and again: one is enough to know that it does
+    not go on. One that leaves such updates out draws other random numbers for the next, which may be sound.
 
     Args:
       config: of the run.
       say: takes the notes.
+      patience: updates in a row, in this chunk and those before it, by which an agent that leaves them out is given up.
 
     Attributes:
       problem: what was seen first of all; None as long as all numbers are finite.
-      nobody_goes_on: whether no update of the last chunk was applied, of any agent.
+      in_a_row: unsound updates up to now, of the agent with the fewest.
     """
 
-    def __init__(self, config: Config, say: Callable[[str], None]):
+    def __init__(self, config: Config, say: Callable[[str], None], patience: int = PATIENCE):
         self._config, self._say = config, say
         self._noted: set[int] = set()
         self._diverged = False
+        self._in_a_row = np.zeros(config.num_agents, int)
+        self._patience = patience if config.run.nan_policy == "skip" else 1
         self.problem: str | None = None
-        self.nobody_goes_on = False
+
+    @property
+    def in_a_row(self) -> int:
+        return int(self._in_a_row.min())
+
+    @property
+    def nobody_goes_on(self) -> bool:
+        """Whether no agent is expected to apply another update."""
+        return self.in_a_row >= self._patience
 
     def look(self, before: TrainState, metrics: Metrics) -> None:
         """Takes in a chunk: the state that it began with, and its metrics, `[S, chunk]`."""
@@ -68,7 +92,7 @@ class Watch:
             if agent not in self._noted:
                 self._noted.add(agent)
                 self._note(agent, first_update[agent], metrics)
-        self.nobody_goes_on = bool((unsound > 0).all())
+        self._in_a_row = np.where((unsound > 0).all(axis=-1), self._in_a_row, 0) + _at_the_end(unsound > 0)
         diverged = np.argwhere(np.asarray(metrics["diverged"]) > 0)
         if len(diverged) and not self._diverged:
             self._diverged = True

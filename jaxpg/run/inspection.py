@@ -23,7 +23,7 @@ class Inspection(NamedTuple):
       run_folder, config: of the run.
       checkpoints: the problem of each checkpoint by its number, None where it is sound; the newest first.
       update: of the newest sound checkpoint; 0 where there is none.
-      schedule: of the run that goes on from there.
+      schedule: of the run.
       finished: whether nothing is left to do.
       owner: the process that is training in it just now, such as "process 12 on atlas"; None where there is none.
       digest: of the state in the newest sound checkpoint; two runs are at the same point, bit for bit, where it is the
@@ -59,7 +59,7 @@ def inspect(path: str) -> Inspection:
     checkpoints = {number: _problem(stored, number) for number in stored.numbers()}
     sound = [number for number, problem in checkpoints.items() if problem is None]
     update = sound[0] if sound else 0
-    schedule = plan(config, done=update)
+    schedule = plan(config)
     before, now = folder.read_versions(run_folder), folder.versions()
     return Inspection(
         run_folder=run_folder,

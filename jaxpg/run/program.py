@@ -23,7 +23,7 @@ from jaxpg.actor_critic import Method, actor_critic, deterministic_policy, reinf
 from jaxpg.distributions import GAUSSIAN, SQUASHED_GAUSSIAN
 from jaxpg.evaluation import Episodes, evaluate
 from jaxpg.features import num_features
-from jaxpg.learning import Reuse
+from jaxpg.learning import Reuse, scale_by_progress
 from jaxpg.networks import Networks, linear_networks, mlp_networks
 from jaxpg.online import online_actor_critic
 from jaxpg.run.agents import Agents, agents_of, with_values
@@ -31,7 +31,7 @@ from jaxpg.run.config import Config
 from jaxpg.run.folder import num_threads
 from jaxpg.run.state import Policy, RunState, current_policy, is_key, start
 from jaxpg.soundness import sound
-from jaxpg.training import initial_state, train_scan
+from jaxpg.training import initial_state, train_chunk
 from jaxpg.types import Algorithm, Metrics, TrainState
 from jaxpg.vector_env import vectorize
 
@@ -47,8 +47,8 @@ class Schedule(NamedTuple):
 
     Attributes:
       steps_per_update: environment steps of one update (of each agent).
-      chunk: updates between two lines of metrics.
-      num_updates: updates of the whole run.
+      chunk: updates between two lines of metrics, which come after each multiple of it and after the last update.
+      num_updates: updates of the whole run, however it is divided.
       eval_every, checkpoint_every: in chunks.
     """
 
@@ -64,7 +64,11 @@ class Schedule(NamedTuple):
 
     def is_due(self, update: int, every: int) -> bool:
         """Whether something done every `every` chunks is due after `update` updates; at the end it always is."""
-        return update >= self.num_updates or (update // self.chunk) % every == 0
+        return update >= self.num_updates or update % (self.chunk * every) == 0
+
+    def until_next_line(self, update: int) -> int:
+        """Updates from `update` to the next line of metrics; also from within a chunk, where a run may have stopped."""
+        return min(self.chunk - update % self.chunk, self.num_updates - update)
 
 
 class Program(NamedTuple):
@@ -72,35 +76,56 @@ class Program(NamedTuple):
 
     Attributes:
       init: `init() -> RunState`; None in the program of a run that is resumed.
-      advance: `advance(TrainState) -> (TrainState, metrics)`, one chunk; metrics are `[S, chunk]`.
+      advance: `advance(TrainState, number=chunk) -> (TrainState, metrics)`, up to a chunk; metrics are `[S, number]`.
       evaluate: `evaluate(Policy) -> Episodes` `[S, eval_episodes]`.
       state_shape: shapes and types of the run's state.
     """
 
     init: Callable[[], RunState] | None
-    advance: Callable[[TrainState], tuple[TrainState, Metrics]]
+    advance: Callable[..., tuple[TrainState, Metrics]]
     evaluate: Callable[[Policy], Episodes]
     state_shape: RunState
 
 
-def plan(config: Config, done: int = 0) -> Schedule:
-    """The updates of a run: intervals in environment steps rounded up to whole updates and chunks.
-
-    Args:
-      config: of the run.
-      done: updates made already; what is left is rounded up to whole chunks.
-    """
+def plan(config: Config) -> Schedule:
+    """The updates of a run: its steps rounded up to whole updates, and intervals to whole updates and chunks."""
     run = config.run
     steps_per_update = run.num_envs * run.num_steps
-    left = max(_ceil(run.total_steps, steps_per_update) - done, 0)
-    chunk = min(_ceil(run.log_interval, steps_per_update), max(left, 1))
+    num_updates = _ceil(run.total_steps, steps_per_update)
+    chunk = min(_ceil(run.log_interval, steps_per_update), num_updates)
     return Schedule(
         steps_per_update=steps_per_update,
         chunk=chunk,
-        num_updates=done + _ceil(left, chunk) * chunk,
+        num_updates=num_updates,
         eval_every=_ceil(run.eval_interval, chunk * steps_per_update),
         checkpoint_every=_ceil(run.checkpoint_interval, chunk * steps_per_update),
     )
+
+
+def described_jump(before: Config, after: Config, update: int) -> str | None:
+    """What jumps where a run goes on with another total, in words; None where nothing does.
+
+    Step sizes and sigma are at any update where a run of the new total, asked for from the beginning, has them.
+
+    Args:
+      before, after: the configuration up to now and from now on.
+      update: updates made.
+    """
+    was, now = (min(update / plan(config).num_updates, 1.0) for config in (before, after))
+    if was == now:
+        return None
+    jumps = []
+    final_lr, network = getattr(after.algo, "final_lr", 1.0), after.network
+    if "algo.final_lr" in after.sweep:
+        jumps.append("step sizes jump")
+    elif final_lr != 1:
+        shares = [f"{1 - (1 - final_lr) * progress:.1%}" for progress in (now, was)]
+        jumps.append(f"step sizes are {shares[0]} of the first, not {shares[1]}")
+    if network.sigma_is == "scheduled":
+        ratio = network.final_sigma / network.sigma
+        sigmas = [f"{network.sigma * ratio**progress:.3g}" for progress in (now, was)]
+        jumps.append(f"sigma is {sigmas[0]}, not {sigmas[1]}")
+    return f"from here on as in a run of {plan(after).total_steps:,} steps: {'; '.join(jumps)}" if jumps else None
 
 
 def make_env(config: Config) -> Any:
@@ -134,6 +159,11 @@ def make_networks(config: Config, env: Any) -> Networks:
 
 def make_algorithm(config: Config, env: Any) -> Algorithm:
     """One agent's algorithm, as pure functions."""
+    algorithm = _make_algorithm(config, env)
+    return with_sigma(algorithm, log_sigma(config)) if config.network.sigma_is == "scheduled" else algorithm
+
+
+def _make_algorithm(config: Config, env: Any) -> Algorithm:
     algo, run, number = config.algo, config.run, config.num_shards
     batch = vectorize(env, run.num_envs // number, training_length(config))
     networks = make_networks(config, env)
@@ -180,41 +210,67 @@ def make_reuse(config: Config) -> Reuse | None:
 
 
 def make_optimizer(config: Config) -> optax.GradientTransformation:
-    """Adam for actor and critic apart, with shortened gradients and linearly falling step sizes; sigma's schedule."""
-    algo, run, reuse = config.algo, config.run, make_reuse(config)
-    horizon = _ceil(run.total_steps, run.num_envs * run.num_steps) * (reuse.epochs * reuse.minibatches if reuse else 1)
+    """Adam for actor and critic apart, with shortened gradients and step sizes that fall with the run's progress."""
+    algo, reuse = config.algo, make_reuse(config)
+    horizon = plan(config).num_updates * (reuse.steps if reuse else 1)
 
     def adam(step_size):
         schedule = optax.linear_schedule(step_size, step_size * algo.final_lr, horizon)
-        return optax.chain(optax.clip_by_global_norm(algo.max_gradient_norm), optax.adam(schedule, eps=1e-5))
+        steps = optax.chain(optax.scale_by_adam(eps=1e-5), scale_by_progress(lambda progress: -1 * schedule(progress)))
+        return optax.chain(optax.clip_by_global_norm(algo.max_gradient_norm), steps)
 
     optimizers = {"actor": adam(algo.actor_lr), "critic": adam(algo.critic_lr)}
     if config.network.sigma_is != "scheduled":
         return optax.multi_transform(optimizers, {"actor": "actor", "critic": "critic"})
-    optimizers["sigma"] = follow(
-        optax.linear_schedule(np.log(config.network.sigma), np.log(config.network.final_sigma), horizon)
-    )
-    return optax.multi_transform(optimizers, _labels)
+    return optax.multi_transform(optimizers | {"sigma": left_alone()}, _labels)
 
 
-def follow(schedule: optax.Schedule) -> optax.GradientTransformation:
-    """Parameters that begin at `schedule(0)` and are `schedule(n)` after n steps, whatever their gradients."""
+def left_alone() -> optax.GradientTransformation:
+    """No step, for parameters that something else sets; the state is a number of steps, as it has always been."""
 
     def init(params):
         return jnp.zeros((), jnp.int32)
 
     def update(gradients, count, params=None):
-        step = schedule(count + 1) - schedule(count)
-        return jax.tree.map(lambda x: jnp.full_like(x, step), gradients), count + 1
+        return jax.tree.map(jnp.zeros_like, gradients), count + 1
 
     return optax.GradientTransformation(init, update)
+
+
+def log_sigma(config: Config) -> optax.Schedule:
+    """log sigma after some updates of the run: from the first value to the last in equal steps, and no further."""
+    first, last = np.log(config.network.sigma), np.log(config.network.final_sigma)
+    return optax.linear_schedule(first, last, plan(config).num_updates)
+
+
+def with_sigma(algorithm: Algorithm, log_sigma: optax.Schedule) -> Algorithm:
+    """The algorithm whose policy has log sigma = `log_sigma(n)` after n updates, whatever its gradients and its past.
+
+    Not a thing that the optimizer does: steps that it does not take, and updates that are left out, hold no schedule up.
+    """
+
+    def settled(state: TrainState) -> TrainState:
+        value = log_sigma(state.update)
+        set_sigma = lambda path, x: jnp.full_like(x, value) if _is_sigma(path) else x  # noqa: E731
+        return state._replace(params=jax.tree_util.tree_map_with_path(set_sigma, state.params))
+
+    def step(state: TrainState, key: jax.Array) -> tuple[TrainState, Metrics]:
+        state, metrics = algorithm.step(settled(state), key)
+        return settled(state), metrics
+
+    return Algorithm(algorithm.init, step)
+
+
+def _is_sigma(path: Any) -> bool:
+    """Whether this is the place of a sigma that does not depend on the state, among the parameters."""
+    return jax.tree_util.keystr(path).endswith("['log_std']")
 
 
 def _labels(params: Any) -> Any:
     """Which optimizer each parameter has, where sigma has one of its own."""
 
     def label(path, _):
-        return "sigma" if jax.tree_util.keystr(path).endswith("['log_std']") else path[0].key
+        return "sigma" if _is_sigma(path) else path[0].key
 
     return jax.tree_util.tree_map_with_path(label, params)
 
@@ -227,7 +283,7 @@ def compile_program(
     resumed: bool = False,
     meanwhile: Callable[[], None] = lambda: None,
 ) -> Program:
-    """Traces and compiles `chunk` updates, the evaluation and the beginning of a run.
+    """Traces and compiles up to `chunk` updates, the evaluation and the beginning of a run.
 
     What is compiled is for `vmap_seeds` agents; all agents are groups of as many, which share the cores. On a CPU that
     is faster than one program for all of them, and each agent has the bits that it has alone. Seeds and swept values
@@ -236,7 +292,7 @@ def compile_program(
 
     Args:
       config, env: of the run.
-      chunk: updates of one call.
+      chunk: updates of one call, at most.
       agents: by default those of the configuration.
       resumed: the state comes from a checkpoint; `init` is not compiled.
       meanwhile: called once while XLA compiles in other threads.
@@ -250,8 +306,8 @@ def compile_program(
     def init(agent):
         return initial_run(algorithm(agent), agent.seed)
 
-    def advance(agent, train):
-        return train_scan(algorithm(agent), jax.random.key(agent.seed), chunk, train)
+    def advance(agent, train, number):
+        return train_chunk(algorithm(agent), jax.random.key(agent.seed), chunk, number, train)
 
     def play_from(policy, starts):
         act = deterministic_policy(networks, policy.params, policy.normalizer)
@@ -269,7 +325,7 @@ def compile_program(
     with _compilers() as pool:
         # Tracing holds Python's lock and compiling does not: one trace after the other, that of the longest compilation
         # first, so that no compilation waits for another one's trace.
-        advance = pool.submit(jax.jit(advance).lower(of_group, shape.train).compile, OPTIMIZED)
+        advance = pool.submit(jax.jit(advance).lower(of_group, shape.train, number=chunk).compile, OPTIMIZED)
         init = None if resumed else pool.submit(init.lower().compile, RUN_ONCE)
         play = pool.submit(jax.jit(play).lower(current_policy(shape.train)).compile, OPTIMIZED)
         meanwhile()
@@ -277,9 +333,14 @@ def compile_program(
     init, advance, play = (
         in_groups(fn.result(), run.vmap_seeds, at_once) if fn else None for fn in (init, advance, play)
     )
+
+    def advance_by(train, number=chunk):
+        train, metrics = advance(agents, train, number=number)
+        return train, {name: np.asarray(x)[:, :number] for name, x in metrics.items()}
+
     return Program(
         functools.partial(init, agents) if init else None,
-        functools.partial(advance, agents),
+        advance_by,
         play,
         jax.tree.map(lambda x: jax.ShapeDtypeStruct((len(agents.seed), *x.shape[1:]), x.dtype), shape),
     )
@@ -307,41 +368,46 @@ def state_shape(algorithm: Algorithm, num_agents: int) -> RunState:
 
 
 def over_agents(fn: Callable, number: int) -> Callable:
-    """`fn` for some agents; a single one is not mapped, so that its program branches instead of selecting."""
-    if number > 1:
-        return jax.vmap(fn)
+    """`fn` for some agents; a single one is not mapped, so that its program branches instead of selecting.
+
+    Arguments by name are the same for all agents.
+    """
 
     @functools.wraps(fn)
-    def one(*arguments):
-        result = fn(*jax.tree.map(lambda x: x[0], arguments))
+    def one(*arguments, **shared):
+        result = fn(*jax.tree.map(lambda x: x[0], arguments), **shared)
         return jax.tree.map(lambda x: x[None], result)
 
-    return one
+    @functools.wraps(fn)
+    def several(*arguments, **shared):
+        return jax.vmap(functools.partial(fn, **shared))(*arguments)
+
+    return several if number > 1 else one
 
 
 def in_groups(compiled: Compiled, size: int, at_once: int) -> Callable:
     """What was compiled for `size` agents, for any multiple of as many: `[S, ...]` to `[S, ...]`.
 
-    One group is handed through as it is; several come back as numpy arrays.
+    Arguments by name are the same for all agents. One group is handed through as it is; several come back as numpy arrays.
 
     Args:
       compiled: takes and gives trees whose leaves begin with the agents' axis.
       size: agents of a group.
       at_once: groups that run at the same time, each in a thread, as XLA computes without Python's lock.
     """
-    where, _ = compiled.input_shardings
+    where, where_shared = compiled.input_shardings
 
-    def fn(*arguments):
-        return compiled(*jax.device_put(arguments, where))  # shards may be wanted on other devices than they came from
+    def fn(*arguments, **shared):  # shards may be wanted on other devices than they came from
+        return compiled(*jax.device_put(arguments, where), **jax.device_put(shared, where_shared))
 
-    def run(*arguments):
+    def run(*arguments, **shared):
         number = len(jax.tree.leaves(arguments)[0])
         if number == size:
-            return fn(*arguments)
+            return fn(*arguments, **shared)
         arguments = jax.tree.map(_on_host, arguments)
         groups = [jax.tree.map(lambda x, i=i: x[i : i + size], arguments) for i in range(0, number, size)]
         with ThreadPoolExecutor(at_once) as pool:
-            results = list(pool.map(lambda group: jax.tree.map(_on_host, fn(*group)), groups))
+            results = list(pool.map(lambda group: jax.tree.map(_on_host, fn(*group, **shared)), groups))
         return jax.tree.map(lambda *parts: (jnp if is_key(parts[0]) else np).concatenate(parts), *results)
 
     return run

@@ -15,13 +15,13 @@ import numpy as np
 from jaxpg.run import agents, figures, folder, lock, memory, results
 from jaxpg.run import config as configuration
 from jaxpg.run.cache import compilation_cache, physics_cache
-from jaxpg.run.chunks import Watch, summary
+from jaxpg.run.chunks import PATIENCE, Watch, summary
 from jaxpg.run.config import Config
 from jaxpg.run.errors import UserError
 from jaxpg.run.folder import MetricsLog, RunFolder, jsonable
 from jaxpg.run.keeper import Keeper
 from jaxpg.run.loggers import follower
-from jaxpg.run.program import Program, Schedule, compile_program, make_env, plan
+from jaxpg.run.program import Program, Schedule, compile_program, described_jump, make_env, plan
 from jaxpg.run.runtime import prepare
 from jaxpg.run.schema import Run
 from jaxpg.run.signals import StopRequests
@@ -91,7 +91,7 @@ def resume(given: Mapping[str, Any]) -> int:
         stored = configuration.load(run_folder.config)
         config = configuration.change(stored, changes)
         _check_same_run(run_folder, stored, config, changes)
-        return _go_on(config, run_folder)
+        return _go_on(stored, config, run_folder)
 
 
 def begin_or_resume(config: Config) -> int:
@@ -110,10 +110,10 @@ def begin_or_resume(config: Config) -> int:
         # The folder may have been moved, or be given in other words.
         config = dataclasses.replace(config, run=dataclasses.replace(config.run, run_dir=stored.run.run_dir))
         _check_same_run(run_folder, stored, config, configuration.named(stored) | configuration.named(config))
-        return _go_on(config, run_folder)
+        return _go_on(stored, config, run_folder)
 
 
-def _go_on(config: Config, run_folder: RunFolder) -> int:
+def _go_on(stored: Config, config: Config, run_folder: RunFolder) -> int:
     from jaxpg.run.checkpoint import Checkpoints
 
     recorded = folder.read_versions(run_folder)
@@ -125,7 +125,7 @@ def _go_on(config: Config, run_folder: RunFolder) -> int:
             f"{run_folder.path} has no checkpoint yet: begin again in another run_dir, or here with resume=auto"
         )
     update, problems = checkpoints.newest_sound()
-    schedule = plan(config, done=update)
+    schedule = plan(config)
     display = Display(schedule.total_steps, steps=update * schedule.steps_per_update)
     for problem in problems:
         display.say(f"note: {problem}; the one before it is used")
@@ -140,12 +140,17 @@ def _go_on(config: Config, run_folder: RunFolder) -> int:
     display.say(
         f"resuming {run_folder.path} at {update * schedule.steps_per_update:,} of {schedule.total_steps:,} steps"
     )
+    jump = described_jump(stored, config, update)
+    if jump:
+        display.say(f"note: {jump}")
     now = folder.versions()
     changed = [name for name in now if recorded.get(name) != now[name]]
     for name in changed:
         display.say(f"note: {name} was {recorded.get(name)} and is {now[name]}: the same run, but not the same bits")
     program, seconds = _compile(session, _env(config), resumed=True)
     state = checkpoints.restore(update, program.state_shape)
+    if config.run.nan_policy == "skip":
+        state = state._replace(train=_side_by_side(state.train))
     folder.replace(run_folder.config, configuration.to_yaml(config))
     if changed:
         folder.change_versions(run_folder, recorded, now)
@@ -196,19 +201,22 @@ def _train(session: Session, program: Program, state: RunState, compile_seconds:
     first = update = _update(state.train)
     log = MetricsLog(run_folder, update, display.say, config.run.loggers)
     keeper = Keeper(config, run_folder, log, display.say)
-    watch, watchdog = Watch(config, display.say), Watchdog()
+    watch, watchdog = Watch(config, display.say, min(PATIENCE, schedule.num_updates)), Watchdog()
     began, seconds_before = time.monotonic(), log.seconds
     display.start()
     try:
         with StopRequests() as stop:
-            while update < schedule.num_updates and not solved and not stop.signal:
-                with watchdog.chunk(f"update {update + 1:,} to {update + schedule.chunk:,}"):
-                    train, metrics = jax.block_until_ready(program.advance(state.train))
+            while update < schedule.num_updates and not (solved or stop.signal or watch.nobody_goes_on):
+                number = schedule.until_next_line(update)
+                with watchdog.chunk(f"update {update + 1:,} to {update + number:,}"):
+                    train, metrics = jax.block_until_ready(program.advance(state.train, number))
                 watch.look(state.train, metrics)
-                if watch.nobody_goes_on:
+                made = _update(train) - update
+                if not made:
                     break
-                state, update = state._replace(train=train), update + schedule.chunk
-                line = {"update": update, "steps": update * schedule.steps_per_update} | summary(metrics)
+                state, update = state._replace(train=train), update + made
+                line = {"update": update, "steps": update * schedule.steps_per_update}
+                line |= summary({name: x[:, :made] for name, x in metrics.items()})
                 if schedule.is_due(update, schedule.eval_every):
                     state, evaluation = _evaluate(program, state)
                     line |= evaluation
@@ -241,8 +249,9 @@ def _ending(
     run, schedule = session.config.run, session.schedule
     steps, again = f"{update * schedule.steps_per_update:,} steps", f"resume={session.run_folder.path}"
     if watch.nobody_goes_on:
-        skipped = run.nan_policy == "skip"
-        advice = "no update after it could be applied" if skipped else f"{again} nan_policy=skip leaves it out"
+        advice = f"{again} nan_policy=skip leaves it out"
+        if run.nan_policy == "skip":
+            advice = f"the last {watch.in_a_row:,} updates could not be applied; {again} tries further ones"
         return EXPLODED, f"error: {watch.problem}; stopped at {steps}; {advice}"
     if keeper.failed:
         return NOT_SAVED, f"error: the last state, at {steps}, could not be saved; {again} repeats what is lost"
@@ -277,6 +286,11 @@ def _write_report(session: Session) -> None:
 def _update(train: TrainState) -> int:
     """The updates made, by the agents that still go on; read by numpy, as jax would compile a program for it."""
     return int(np.asarray(train.update).max())
+
+
+def _side_by_side(train: TrainState) -> TrainState:
+    """Agents that have stood still go on with the others: the updates that they have missed count as left out."""
+    return train._replace(update=np.full_like(train.update, _update(train)))
 
 
 def _draw(session: Session) -> list[dict[str, Any]]:
