@@ -15,7 +15,7 @@ import jaxlib
 from jaxpg.compatibility import may_deadlock
 from jaxpg.run.config import Config
 from jaxpg.run.errors import UserError
-from jaxpg.run.folder import num_threads
+from jaxpg.run.versions import num_threads
 
 MAY_CALL_LAPACK = ("brax", "playground")
 
