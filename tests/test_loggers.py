@@ -244,7 +244,7 @@ def test_a_service_that_hangs_holds_nothing_up(run_folder, stand_in, monkeypatch
     """More words than the pipe takes do not block, and the end waits no longer than it is allowed to."""
     monkeypatch.setenv("STAND_IN_HANGS", "1")
     monkeypatch.setattr(follower, "CLOSING", 0.1)
-    service = follower.Follower("wandb", run_folder.metrics, run_folder.config, run_folder.loggers)
+    service = follower.Follower("wandb", run_folder.loggers)
     run_folder.metrics.touch()
     for step in range(1 << 17):
         service.write({}, step)

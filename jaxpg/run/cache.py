@@ -33,7 +33,7 @@ import jaxlib
 from jax.experimental.compilation_cache import compilation_cache as jax_cache
 
 from envs.physics import storage
-from jaxpg.run.folder import num_threads
+from jaxpg.run.versions import num_threads
 
 MAX_AGE = 30 * 24 * 3600.0  # seconds; an older entry is removed, and compiled anew when it is needed
 MAX_BYTES = 64 * 2**20  # of all entries together: every start reads those of its folder. A training takes half a MB.

@@ -8,6 +8,7 @@ after. Saves are synchronous (an asynchronous one is lost, with status 0, if the
 from __future__ import annotations
 
 import contextlib
+import errno
 import functools
 import hashlib
 import json
@@ -15,7 +16,9 @@ import logging
 import os
 import re
 import shutil
+import stat
 import sys
+import weakref
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
@@ -24,6 +27,7 @@ import jax
 import numpy as np
 from orbax import checkpoint as ocp
 
+from jaxpg.run import files
 from jaxpg.run.errors import UserError
 from jaxpg.run.state import is_key
 from jaxpg.types import PyTree
@@ -31,6 +35,14 @@ from jaxpg.types import PyTree
 
 class CheckpointError(UserError):
     """A checkpoint that is missing, damaged, or of another program."""
+
+    word = "damaged"  # in a list of checkpoints
+
+
+class OtherRunError(CheckpointError):
+    """A sound checkpoint, of another run."""
+
+    word = "of another run"
 
 
 class SaveError(Exception):
@@ -50,26 +62,42 @@ class Checkpoints:
     """
 
     def __init__(self, folder: Path, keep: int = 3, read_only: bool = False):
-        self.folder = folder.resolve()
+        self.folder = folder
+        self._read_only = read_only
         self._options = ocp.CheckpointManagerOptions(
             max_to_keep=keep,
             enable_async_checkpointing=False,
             cleanup_tmp_directories=not read_only,
-            create=not read_only,
+            create=False,
         )
-        self._manager = self._open()
         self._failed = False
-
-    def _open(self) -> ocp.CheckpointManager:
-        _silence_what_is_left_behind()
+        self._proven = False  # whether what this object has saved could be read
+        self._manager: ocp.CheckpointManager | None = None
+        self._place = folder
         try:
-            return ocp.CheckpointManager(self.folder, item_names=("state", "meta"), options=self._options)
-        except Exception as error:
-            raise CheckpointError(f"{self.folder}: not a folder for checkpoints ({_reason(error)})") from error
+            self._open()
+        except Exception as error:  # of a dozen types
+            if read_only and not os.path.lexists(folder):
+                return  # it has none yet
+            raise CheckpointError(f"{folder}: not a folder for checkpoints ({_reason(error)})") from error
+
+    def _open(self) -> None:
+        """Holds the folder by a descriptor, as orbax then does: its name may change, or be one that orbax cannot read.
+
+        Raises:
+          OSError: it cannot be made or opened, or has links in it, through which orbax would write and delete.
+        """
+        _silence_what_is_left_behind()
+        descriptor = files.open_folder(self.folder, make=not self._read_only)
+        self._close = weakref.finalize(self, os.close, descriptor)
+        self._descriptor, self._place = descriptor, files.through(descriptor)
+        if not self._read_only:
+            _check_no_links(descriptor)
+        self._manager = ocp.CheckpointManager(self._place, item_names=("state", "meta"), options=self._options)
 
     def latest(self) -> int | None:
         """The newest checkpoint's number, or None where there is none."""
-        return self._manager.latest_step()
+        return max(self.numbers(), default=None)
 
     def newest_sound(self) -> tuple[int, list[str]]:
         """The newest checkpoint that is undamaged, and what is wrong with those after it, one line each.
@@ -88,7 +116,7 @@ class Checkpoints:
 
     def numbers(self) -> list[int]:
         """The numbers of all checkpoints, the newest first."""
-        return sorted(self._manager.all_steps(), reverse=True)
+        return sorted(self._manager.all_steps(), reverse=True) if self._manager else []
 
     def save(self, step: int, tree: PyTree, meta: Mapping[str, Any]) -> None:
         """Writes `tree` and `meta` as checkpoint `step`.
@@ -99,16 +127,17 @@ class Checkpoints:
         leaves = _host_leaves(tree)
         content = {name: leaf for name, leaf in leaves.items() if leaf.size}  # orbax refuses empty arrays
         record = {"step": step, "meta": dict(meta), "leaves": {name: _describe(leaf) for name, leaf in leaves.items()}}
+        record["sha256"] = _digest(record)
         arguments = ocp.args.Composite(state=ocp.args.StandardSave(content), meta=ocp.args.JsonSave(record))
         with self._writing(step):
             saved = self._manager.save(step, args=arguments)
             if saved:
-                _to_disk(self.folder / str(step))
-            if self._failed:  # what still wrote for the failed save may have written into this one
+                _to_disk(self._place / str(step))
+            if saved and not self._proven:  # what still wrote for a failed save may have written into this one
                 self.read(step)
         if not saved:
             raise RuntimeError(f"orbax declined to save step {step} after step {self.latest()}")
-        self._failed = False
+        self._failed, self._proven = False, True
 
     def replace(self, step: int, tree: PyTree, meta: Mapping[str, Any]) -> None:
         """Writes checkpoint `step` as the newest, also where one of the same or a later number is there already.
@@ -126,23 +155,31 @@ class Checkpoints:
         """Whatever orbax raises inside is a SaveError, and is forgotten before the next save."""
         _silence_what_is_left_behind()
         try:
-            self.folder.mkdir(exist_ok=True)  # not its parents: a run folder that is gone is not made again
-            if self._failed:
-                self._start_anew()
+            self._follow()
             yield
         except Exception as error:  # a full disk surfaces as any of a dozen types
-            self._failed = True
+            self._failed, self._proven = True, False
             self._remove_unfinished()
             raise SaveError(f"{self.folder / str(step)}: cannot be written ({_reason(error)})") from error
 
-    def _start_anew(self) -> None:
-        """With what is on the disk now, whatever orbax remembers of the failed save."""
-        self._remove_unfinished()
-        self._manager = self._open()
+    def _follow(self) -> None:
+        """Starts anew where a save has failed, or where there is another folder now: what orbax remembers is not so.
+
+        A run folder that is gone is not made again.
+        """
+        with files.opened(self.folder, make=True) as now:
+            same = os.path.sameopenfile(now, self._descriptor) and self._place == files.through(self._descriptor)
+        if self._failed:
+            self._remove_unfinished()
+            self._close.detach()  # what still writes for the failed save must not get another folder by this number
+            self._open()
+        elif not same:
+            self._close()
+            self._open()
 
     def _remove_unfinished(self) -> None:
         """What a failed save has left: it takes space."""
-        for unfinished in self.folder.glob("*.orbax-checkpoint-tmp*"):
+        for unfinished in self._place.glob("*.orbax-checkpoint-tmp*"):
             shutil.rmtree(unfinished, ignore_errors=True)
 
     def record(self, step: int) -> dict[str, Any]:
@@ -154,10 +191,13 @@ class Checkpoints:
         record = self._read(step, meta=ocp.args.JsonRestore())["meta"]
         try:
             _kinds(record["leaves"])
-            return {name: record[name] for name in ("step", "meta", "leaves")}
+            found = {name: record[name] for name in ("step", "meta", "leaves")}
         except (TypeError, ValueError, KeyError, AttributeError) as error:  # JSON all the same, after a flipped bit
             problem = f"{self.folder / str(step)}: damaged, its record is not one of ours ({_reason(error)})"
             raise CheckpointError(problem) from error
+        if record.get("sha256", _digest(found)) != _digest(found):  # earlier versions have written none
+            raise CheckpointError(f"{self.folder / str(step)}: damaged, its record differs from what was saved")
+        return found
 
     def read(self, step: int) -> dict[str, np.ndarray]:
         """Every leaf of checkpoint `step` by its name, verified; random keys as the numbers that they are stored as.
@@ -203,8 +243,7 @@ class Checkpoints:
         Raises:
           CheckpointError: the record cannot be read.
         """
-        leaves = json.dumps(self.record(step)["leaves"], sort_keys=True)
-        return hashlib.sha256(leaves.encode()).hexdigest()
+        return _digest(self.record(step)["leaves"])
 
     def _check_same_program(self, step: int, recorded: Mapping[str, Any], expected: Mapping[str, Any]) -> None:
         names = sorted(recorded.keys() ^ expected.keys())
@@ -223,9 +262,25 @@ class Checkpoints:
     def _read(self, step: int, **items: Any) -> Any:
         _silence_what_is_left_behind()
         try:
+            _check_own(self._place / str(step))
             return self._manager.restore(step, args=ocp.args.Composite(**items))
         except Exception as error:  # a damaged file surfaces as any of a dozen types
-            raise CheckpointError(f"{self.folder / str(step)}: cannot be read ({_reason(error)})") from error
+            reason = _reason(error).replace(str(self._place), str(self.folder))
+            raise CheckpointError(f"{self.folder / str(step)}: cannot be read ({reason})") from error
+
+
+def _check_no_links(folder: int) -> None:
+    for name in os.listdir(folder):
+        if files.is_link(name, folder):
+            raise OSError(errno.ELOOP, f"{name}: {files.A_LINK}")
+
+
+def _check_own(folder: Path) -> None:
+    """Raises OSError where there is anything but files and folders: a link may lead anywhere, a pipe never ends."""
+    for path in (folder, *folder.rglob("*")):
+        mode = path.lstat().st_mode
+        if not stat.S_ISREG(mode) and not stat.S_ISDIR(mode):
+            raise OSError(errno.ELOOP, f"{path.name}: {files.A_LINK if stat.S_ISLNK(mode) else 'it is no file'}")
 
 
 def _to_disk(folder: Path) -> None:
@@ -244,7 +299,7 @@ def _reason(error: BaseException) -> str:
     while cause is not None:
         code = re.search(r"os_error_code='(\d+)'", str(cause))  # tensorstore's, in a ValueError
         if code or (isinstance(cause, OSError) and cause.errno):
-            return os.strerror(int(code[1]) if code else cause.errno)
+            return os.strerror(int(code[1])) if code else cause.strerror
         cause = cause.__cause__ or cause.__context__
     return (str(error).splitlines() or [type(error).__name__])[0]
 
@@ -302,6 +357,10 @@ def _key_impl(leaf: Any) -> str:
     return next(
         name for name in names if jax.eval_shape(functools.partial(jax.random.key, 0, impl=name)).dtype == leaf.dtype
     )
+
+
+def _digest(record: Mapping[str, Any]) -> str:
+    return hashlib.sha256(json.dumps(record, sort_keys=True).encode()).hexdigest()
 
 
 def _describe(leaf: np.ndarray) -> list[Any]:

@@ -3,20 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 import numpy as np
 
 from jaxpg.run.statistics import bootstrap_interval, interquartile_mean
 
 
-def learning_curve(lines: Sequence[dict[str, Any]], path: Path, title: str) -> None:
+def learning_curve(lines: Sequence[dict[str, Any]], file: BinaryIO, title: str) -> None:
     """Return, and success where there is one, over environment steps.
 
     Args:
       lines: of `metrics.jsonl`; values of several agents are lists, drawn as interquartile mean and 95 % interval.
-      path: the PNG to write.
+      file: takes the PNG.
       title: above the picture.
     """
     figure, panels = _panels(lines, title)
@@ -24,14 +23,14 @@ def learning_curve(lines: Sequence[dict[str, Any]], path: Path, title: str) -> N
     for name, axes in panels.items():
         draw_curve(axes, *series(lines, name), "deterministic policy")
         axes.legend()
-    figure.savefig(path, dpi=120)
+    figure.savefig(file, dpi=120)
 
 
-def sweep_curves(lines: Sequence[dict[str, Any]], path: Path, title: str, settings: Mapping[str, slice]) -> None:
+def sweep_curves(lines: Sequence[dict[str, Any]], file: BinaryIO, title: str, settings: Mapping[str, slice]) -> None:
     """Return of the deterministic policy, and success where there is one, over environment steps: a curve a setting.
 
     Args:
-      lines, path, title: as in `learning_curve`.
+      lines, file, title: as in `learning_curve`.
       settings: label -> its agents, in the order of the legend.
     """
     figure, panels = _panels(lines, f"{title}, deterministic policy")
@@ -44,7 +43,7 @@ def sweep_curves(lines: Sequence[dict[str, Any]], path: Path, title: str, settin
     legend = figure.legend(handles, labels, loc="outside right center", title=title, fontsize=8, title_fontsize=8)
     # Beside the panels, which keep their size.
     figure.set_figwidth(figure.get_figwidth() + legend.get_window_extent().width / figure.dpi)
-    figure.savefig(path, dpi=120)
+    figure.savefig(file, dpi=120)
 
 
 def _panels(lines: Sequence[dict[str, Any]], title: str) -> tuple[Any, dict[str, Any]]:

@@ -14,35 +14,23 @@ import secrets
 import stat
 from collections.abc import Iterator
 from pathlib import Path
-
-from jaxpg.run.errors import UserError
+from typing import BinaryIO
 
 UNFINISHED = ".unfinished"  # ends the name of a file that is renamed once it is complete
 FOLDER = os.O_RDONLY | os.O_DIRECTORY
 A_LINK = "it is a link, and what is in a run folder must be its own"
+NO_FILE = (errno.EINVAL, errno.ELOOP)  # of what is found where a file was expected
 
 _owned: dict[Path, int] = {}  # the folders that this process owns, by the names that they were given
 
 
-def replace(path: str | Path, content: str | bytes) -> None:
+def replace(path: Path, content: bytes) -> None:
     """Writes a file that others, and who comes after a kill or a power failure, see as it was or whole.
 
-    A link of that name is replaced, and what it leads to stays as it is.
-
-    Args:
-      path: the file; its folder is there already.
-      content: text is written as UTF-8, what no text can have (a file's name may) as an escape.
-
-    Raises:
-      UserError: it cannot be written.
+    A link of that name is replaced, and what it leads to stays as it is. Raises OSError.
     """
-    path = Path(path)
-    data = content.encode("utf-8", "backslashreplace") if isinstance(content, str) else content
-    try:
-        with opened(path.parent) as folder:
-            _replace(folder, path.name, data)
-    except OSError as error:
-        raise UserError(f"{path}: cannot be written ({error.strerror})") from error
+    with opened(path.parent) as folder:
+        _replace(folder, path.name, content)
 
 
 def _replace(folder: int, name: str, content: bytes) -> None:
@@ -54,35 +42,36 @@ def _replace(folder: int, name: str, content: bytes) -> None:
             file.flush()
             os.fsync(file.fileno())
         os.replace(unfinished, name, src_dir_fd=folder, dst_dir_fd=folder)
-    except OSError:
+    except BaseException:
         with contextlib.suppress(OSError):
             os.unlink(unfinished, dir_fd=folder)
         raise
 
 
-def read(path: str | Path) -> bytes:
-    """The content of a file.
+def read(path: Path) -> bytes:
+    """The content of a file; raises OSError, also where that is a link in a run folder, a folder or a device."""
+    with opened_in(path, os.O_RDONLY) as file:
+        return file.read()
 
-    Raises:
-      FileNotFoundError: there is none. UserError: it cannot be read, or is a folder, a link or a device.
-    """
-    path = Path(path)
-    try:
-        with opened(path.parent) as folder, os.fdopen(open_in(folder, path.name, os.O_RDONLY), "rb") as file:
-            return file.read()
-    except FileNotFoundError:
-        raise
-    except OSError as error:
-        raise UserError(f"{path}: cannot be read ({error.strerror})") from error
+
+@contextlib.contextmanager
+def opened_in(path: Path, flags: int) -> Iterator[BinaryIO]:
+    """A file, open for what the flags of `os.open` say, inside; raises OSError as `read`."""
+    mode = {os.O_RDONLY: "rb", os.O_WRONLY: "wb", os.O_RDWR: "r+b"}[flags & os.O_ACCMODE]
+    with opened(path.parent) as folder, os.fdopen(open_in(folder, path.name, flags), mode) as file:
+        yield file
 
 
 def open_in(folder: int, name: str, flags: int) -> int:
     """A descriptor of the file of this name in an open folder; raises OSError for what is no file of its own."""
-    descriptor = _open(name, flags | os.O_NONBLOCK, folder)  # or a pipe would wait for somebody to write
+    try:
+        descriptor = _open(name, flags | os.O_NONBLOCK, folder)  # or a pipe would wait for somebody to write
+    except IsADirectoryError:
+        raise OSError(errno.EINVAL, "it is no file") from None
     mode = os.fstat(descriptor).st_mode
     if not stat.S_ISREG(mode):
         os.close(descriptor)
-        raise OSError(errno.EISDIR if stat.S_ISDIR(mode) else errno.EINVAL, "it is no file")
+        raise OSError(errno.EINVAL, "it is no file")
     return descriptor
 
 
@@ -91,7 +80,7 @@ def opened(folder: Path, make: bool = False) -> Iterator[int]:
     """A descriptor of a folder, inside.
 
     Args:
-      folder: one that is owned or in one that is, another run's or its folder, or any.
+      folder: any; links that lead to it are followed as far as a run folder, and not inside.
       make: where there is none; not those above it.
 
     Raises:
@@ -109,7 +98,7 @@ def open_folder(folder: Path, make: bool = False) -> int:
     for root, owner in _owned.items():
         if Path(os.path.abspath(folder)).is_relative_to(root):
             return _open_own(os.path.relpath(folder, root), owner, make)
-    if (folder.parent / "config.yaml").exists():
+    if all(os.path.lexists(folder.parent / name) for name in ("config.yaml", "best")):
         return _open_own(os.path.abspath(folder), None, make)
     if make:
         folder.mkdir(exist_ok=True)
@@ -153,7 +142,7 @@ def owned(path: Path, descriptor: int) -> Iterator[None]:
 
 
 def whereabouts(path: Path) -> Path:
-    """Where an owned folder is now: it may have been moved. Any other is where it is; one that was removed, where it was."""
+    """The name that an owned folder has now, for it may have been moved; of any other the given one."""
     descriptor = _owned.get(Path(os.path.abspath(path)))
     if descriptor is None or is_at(path, descriptor):
         return path
@@ -185,7 +174,7 @@ def through(descriptor: int) -> Path:
 
 
 def goes_through() -> bool:
-    """Whether paths through descriptors hide the folders' names from libraries, which take some letters for patterns."""
+    """Whether libraries, which take some letters for patterns, need not see the names of folders."""
     with opened(Path("/")) as folder:
         return is_at(f"/proc/self/fd/{folder}", folder)
 

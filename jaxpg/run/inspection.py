@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any, NamedTuple
 
-from jaxpg.run import agents, folder, lock
+from jaxpg.run import agents, folder, lock, same_run, versions
 from jaxpg.run import config as configuration
 from jaxpg.run.checkpoint import CheckpointError, Checkpoints
 from jaxpg.run.config import Config
@@ -21,7 +21,8 @@ class Inspection(NamedTuple):
 
     Attributes:
       run_folder, config: of the run.
-      checkpoints: the problem of each checkpoint by its number, None where it is sound; the newest first.
+      checkpoints: the problem of each checkpoint by its number, None where it is sound and of this run; the newest
+        first.
       update: of the newest sound checkpoint; 0 where there is none.
       schedule: of the run.
       finished: whether nothing is left to do.
@@ -35,7 +36,7 @@ class Inspection(NamedTuple):
 
     run_folder: RunFolder
     config: Config
-    checkpoints: dict[int, str | None]
+    checkpoints: dict[int, CheckpointError | None]
     update: int
     schedule: Schedule
     finished: bool
@@ -56,11 +57,11 @@ def inspect(path: str) -> Inspection:
     config, lines = configuration.load(run_folder.config), folder.read_metrics(run_folder)
     prepare(config)  # as for a training, whose versions are compared
     stored = Checkpoints(run_folder.checkpoints, read_only=True)
-    checkpoints = {number: _problem(stored, number) for number in stored.numbers()}
+    checkpoints = {number: _problem(stored, number, config) for number in stored.numbers()}
     sound = [number for number, problem in checkpoints.items() if problem is None]
     update = sound[0] if sound else 0
     schedule = plan(config)
-    before, now = folder.read_versions(run_folder), folder.versions()
+    before = folder.read_versions(run_folder)
     return Inspection(
         run_folder=run_folder,
         config=config,
@@ -71,16 +72,17 @@ def inspect(path: str) -> Inspection:
         owner=lock.owner(run_folder.path),
         digest=stored.digest(update) if sound else None,
         lines=lines,
-        changed={name: (before.get(name), value) for name, value in now.items() if before.get(name) != value},
+        changed=versions.changes(before, versions.versions()),
         earlier=len(before.get("earlier", [])),
     )
 
 
-def _problem(checkpoints: Checkpoints, number: int) -> str | None:
+def _problem(checkpoints: Checkpoints, number: int, config: Config) -> CheckpointError | None:
     try:
         checkpoints.read(number)
+        same_run.check_checkpoint(checkpoints, number, config)
     except CheckpointError as error:
-        return str(error)
+        return error
     return None
 
 
@@ -104,7 +106,7 @@ def described(found: Inspection) -> str:
         "run": agents.described(config),
         "progress": f"{done:,} of {total:,} steps, " + ("finished" if found.finished else "not finished"),
         "checkpoints": ", ".join(
-            f"{number} {'sound' if problem is None else 'damaged'}" for number, problem in found.checkpoints.items()
+            f"{number} {'sound' if problem is None else problem.word}" for number, problem in found.checkpoints.items()
         )
         or "none",
     }
@@ -123,5 +125,5 @@ def described(found: Inspection) -> str:
     if found.earlier:
         rows["versions"] += f"; {found.earlier} others before (versions.json)"
     rows["digest"] = found.digest or "none"
-    problems = [f"damaged: {problem}" for problem in found.checkpoints.values() if problem]
+    problems = [f"{problem.word}: {problem}" for problem in found.checkpoints.values() if problem]
     return "\n".join([f"{name:<12} {value}" for name, value in rows.items()] + problems)

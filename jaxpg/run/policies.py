@@ -12,7 +12,7 @@ from envs.base import Interface, interface
 from jaxpg import normalization
 from jaxpg.actor_critic import deterministic_policy
 from jaxpg.run import config as configuration
-from jaxpg.run import folder
+from jaxpg.run import folder, same_run
 from jaxpg.run.agents import alone, described_agent
 from jaxpg.run.checkpoint import Checkpoints
 from jaxpg.run.config import Config
@@ -67,7 +67,7 @@ def load(
       changes: options to change, by dotted name; `env.*` alone makes sense here.
 
     Raises:
-      UserError: no run folder, no checkpoint in it, or no such agent.
+      UserError: no run folder, no checkpoint in it, one of another run, or no such agent.
     """
     (stored,) = load_several(run, [which], agent, changes)
     return stored
@@ -83,18 +83,19 @@ def load_several(
       kinds: of "best" and "last".
     """
     run_folder = folder.find(run)
-    config = configuration.change(configuration.load(run_folder.config), changes or {})
+    stored = configuration.load(run_folder.config)
+    config = configuration.change(stored, changes or {})
     prepare(config)  # environments of other libraries may hang without
     env = make_env(config)
     shape = state_shape(make_algorithm(config, env), config.num_agents)
-    best, update = _restore(Checkpoints(run_folder.best, read_only=True), shape.best, run)
+    best, update = _restore(Checkpoints(run_folder.best, read_only=True), shape.best, stored)
     if agent is None:
         agent = int(np.argmax(best.episode_return))
     if not 0 <= agent < config.num_agents:
         raise UserError(f"agent={agent}: the run has agents 0 to {config.num_agents - 1}")
     found: dict[str, tuple[Policy, int]] = {"best": (best.policy, update)}
     if "last" in kinds:
-        state, update = _restore(Checkpoints(run_folder.checkpoints, read_only=True), shape, run)
+        state, update = _restore(Checkpoints(run_folder.checkpoints, read_only=True), shape, stored)
         found["last"] = current_policy(state.train), update
     of_agent = {
         kind: (jax.tree.map(lambda x: np.asarray(x)[agent], policy), at) for kind, (policy, at) in found.items()
@@ -130,8 +131,10 @@ def untrained(stored: StoredPolicy) -> StoredPolicy:
     return stored._replace(policy=jax.tree.map(np.asarray, policy), update=0)
 
 
-def _restore(checkpoints: Checkpoints, template: Any, run: str) -> tuple[Any, int]:
+def _restore(checkpoints: Checkpoints, template: Any, config: Config) -> tuple[Any, int]:
+    """The newest checkpoint, and the updates made before it; `config` is that of the run folder."""
     update = checkpoints.latest()
     if update is None:
-        raise UserError(f"{run} has no checkpoint yet")
+        raise UserError(f"{checkpoints.folder}: no checkpoint yet")
+    same_run.check_checkpoint(checkpoints, update, config)
     return checkpoints.restore(update, template), update

@@ -28,8 +28,8 @@ from jaxpg.networks import Networks, linear_networks, mlp_networks
 from jaxpg.online import online_actor_critic
 from jaxpg.run.agents import Agents, agents_of, with_values
 from jaxpg.run.config import Config
-from jaxpg.run.folder import num_threads
 from jaxpg.run.state import Policy, RunState, current_policy, is_key, start
+from jaxpg.run.versions import num_threads
 from jaxpg.soundness import sound
 from jaxpg.training import initial_state, train_chunk
 from jaxpg.types import Algorithm, Metrics, TrainState

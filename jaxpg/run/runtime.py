@@ -13,7 +13,7 @@ import jaxlib
 from jaxpg.compatibility import may_deadlock
 from jaxpg.run.config import LIBRARIES, Config
 from jaxpg.run.errors import UserError
-from jaxpg.run.folder import num_threads
+from jaxpg.run.versions import num_threads
 
 
 def prepare(config: Config, threads: int | None = None) -> None:

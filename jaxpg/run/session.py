@@ -4,15 +4,16 @@ from __future__ import annotations
 
 import dataclasses
 import importlib
+import io
 import time
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Mapping
 from signal import Signals
 from typing import Any, NamedTuple
 
 import jax
 import numpy as np
 
-from jaxpg.run import agents, figures, folder, lock, memory, results
+from jaxpg.run import agents, figures, folder, lock, memory, results, same_run, versions
 from jaxpg.run import config as configuration
 from jaxpg.run.cache import compilation_cache, physics_cache
 from jaxpg.run.chunks import PATIENCE, Watch, summary
@@ -33,11 +34,6 @@ from jaxpg.types import TrainState
 
 # Slow to import and not needed before training: imported while XLA compiles.
 NEEDED_LATER = ("jaxpg.run.checkpoint", "tensorboardX", "matplotlib.figure", "matplotlib.backends.backend_agg")
-# What may change together with resume=DIR; anything else would be another run.
-RESUMABLE = (
-    *("total_steps", "log_interval", "eval_interval", "checkpoint_interval"),
-    *("stop_return", "stop_agents", "nan_policy", "loggers", "cache", "report"),
-)
 EXPLODED = 4  # the exit status of a run that ended because its numbers were not finite any more
 NOT_SAVED = 5  # the exit status of a run whose last state is on no disk
 
@@ -90,7 +86,7 @@ def resume(given: Mapping[str, Any]) -> int:
     with folder.owned(run_folder, print):
         stored = configuration.load(run_folder.config)
         config = configuration.change(stored, changes)
-        _check_same_run(run_folder, stored, config, changes)
+        same_run.check_options(run_folder, stored, config, changes)
         return _go_on(stored, config, run_folder)
 
 
@@ -109,7 +105,7 @@ def begin_or_resume(config: Config) -> int:
         stored = configuration.load(run_folder.config)
         # The folder may have been moved, or be given in other words.
         config = dataclasses.replace(config, run=dataclasses.replace(config.run, run_dir=stored.run.run_dir))
-        _check_same_run(run_folder, stored, config, configuration.named(stored) | configuration.named(config))
+        same_run.check_options(run_folder, stored, config, configuration.named(stored) | configuration.named(config))
         return _go_on(stored, config, run_folder)
 
 
@@ -125,6 +121,7 @@ def _go_on(stored: Config, config: Config, run_folder: RunFolder) -> int:
             f"{run_folder.path} has no checkpoint yet: begin again in another run_dir, or here with resume=auto"
         )
     update, problems = checkpoints.newest_sound()
+    same_run.check_checkpoint(checkpoints, update, config)
     schedule = plan(config)
     display = Display(schedule.total_steps, steps=update * schedule.steps_per_update)
     for problem in problems:
@@ -143,10 +140,10 @@ def _go_on(stored: Config, config: Config, run_folder: RunFolder) -> int:
     jump = described_jump(stored, config, update)
     if jump:
         display.say(f"note: {jump}")
-    now = folder.versions()
-    changed = [name for name in now if recorded.get(name) != now[name]]
-    for name in changed:
-        display.say(f"note: {name} was {recorded.get(name)} and is {now[name]}: the same run, but not the same bits")
+    now = versions.versions()
+    changed = versions.changes(recorded, now)
+    for change in changed.items():
+        display.say(f"note: {versions.described(*change)}")
     program, seconds = _compile(session, _env(config), resumed=True)
     state = checkpoints.restore(update, program.state_shape)
     if config.run.nan_policy == "skip":
@@ -155,17 +152,6 @@ def _go_on(stored: Config, config: Config, run_folder: RunFolder) -> int:
     if changed:
         folder.change_versions(run_folder, recorded, now)
     return _train(session, program, state, seconds)
-
-
-def _check_same_run(run_folder: RunFolder, stored: Config, config: Config, names: Iterable[str]) -> None:
-    """Raises UserError where one of these options has changed that would make it another run."""
-    before, after = configuration.named(stored), configuration.named(config)
-    for name in names:
-        if name not in RESUMABLE and before.get(name) != after.get(name):
-            given, has = (f"{name}={values[name]}" if name in values else f"no {name}" for values in (after, before))
-            raise UserError(
-                f"{given}: {run_folder.path} has {has}, and on resume only {', '.join(RESUMABLE)} may change"
-            )
 
 
 def _env(config: Config) -> Any:
@@ -297,13 +283,15 @@ def _draw(session: Session) -> list[dict[str, Any]]:
     """Draws the learning curve, if it can be written; returns the lines of metrics that it shows."""
     config, run_folder = session.config, session.run_folder
     lines, title = folder.read_metrics(run_folder), agents.described(config)
+    picture = io.BytesIO()
+    if config.sweep:
+        figures.sweep_curves(lines, picture, title, results.curves(config, lines))
+    else:
+        figures.learning_curve(lines, picture, title)
     try:
-        if config.sweep:
-            figures.sweep_curves(lines, run_folder.learning_curve, title, results.curves(config, lines))
-        else:
-            figures.learning_curve(lines, run_folder.learning_curve, title)
-    except OSError as error:
-        session.display.say(f"note: {run_folder.learning_curve}: cannot be written ({error.strerror})")
+        folder.replace(run_folder.learning_curve, picture.getvalue())
+    except UserError as error:
+        session.display.say(f"note: {error}")
     return lines
 
 

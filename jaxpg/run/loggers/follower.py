@@ -9,8 +9,11 @@ import os
 import subprocess
 import sys
 from collections.abc import Iterable, Mapping
+from contextlib import AbstractContextManager
 from pathlib import Path
+from typing import BinaryIO
 
+from jaxpg.run import files
 from jaxpg.run.errors import UserError
 from jaxpg.run.loggers import SERVICES, LoggerError
 from jaxpg.run.loggers.sender import ERROR, LONGEST
@@ -27,29 +30,30 @@ class Follower:
 
     Args:
       name: of the service, in `SERVICES`.
-      metrics: the file with the lines, which has them before they are written here.
-      config: the run's `config.yaml`.
-      folder: where the service keeps what it has to; made where there is none.
+      folder: where the service keeps what it has to, in the run folder; made where there is none. The lines are in
+        the run's `metrics.jsonl` before they are written here.
 
     Raises:
       OSError: the process cannot be started.
     """
 
-    def __init__(self, name: str, metrics: Path, config: Path, folder: Path):
-        folder.mkdir(exist_ok=True)
+    def __init__(self, name: str, folder: Path):
         self._log = folder / f"{name}.log"
-        arguments = [name, str(metrics), str(config), str(folder)]
-        with self._log.open("ab") as log:
+        with files.opened(folder.parent) as run, files.opened(folder, make=True), self._opened_log() as log:
             self._process = subprocess.Popen(
-                [sys.executable, "-m", "jaxpg.run.loggers.sender", *arguments],
+                [sys.executable, "-m", "jaxpg.run.loggers.sender", name, str(files.through(run))],
                 stdin=subprocess.PIPE,
                 stdout=log,
                 stderr=log,
                 bufsize=0,
                 start_new_session=True,
+                pass_fds=(run,),  # by which it finds the run folder, wherever that is moved
             )
         self._pipe = self._process.stdin
         os.set_blocking(self._pipe.fileno(), False)
+
+    def _opened_log(self) -> AbstractContextManager[BinaryIO]:
+        return files.opened_in(self._log, os.O_WRONLY | os.O_APPEND | os.O_CREAT)
 
     def write(self, values: Mapping[str, float], step: int) -> None:
         """Says that there is a line; raises LoggerError where the process has ended."""
@@ -75,7 +79,7 @@ class Follower:
             raise LoggerError(f"{self._problem()}; it has not got all metrics")
 
     def _problem(self) -> str:
-        lines = self._log.read_text(encoding="utf-8", errors="replace").splitlines()
+        lines = files.read(self._log).decode(errors="replace").splitlines()
         errors = [line.removeprefix(ERROR) for line in lines if line.startswith(ERROR)]
         return f"{errors[-1]} ({self._log})" if errors else f"ended, see {self._log}"
 

@@ -9,6 +9,8 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
+from jaxpg.run import files
+
 FLUSH_INTERVAL = 2.0  # seconds; a database takes some 30 ms for one line, and for sixty 150
 BATCH = 1000  # metrics that MLflow takes at once
 PARAMS = 100  # parameters that it takes at once
@@ -42,12 +44,12 @@ class MLflow:
         import mlflow
 
         path = folder / "mlflow.json"
-        kept = json.loads(path.read_text()) if path.exists() else {}
+        kept = json.loads(files.read(path)) if os.path.lexists(path) else {}
         given = os.environ.get("MLFLOW_TRACKING_URI")  # not kept: it may have a password in it
         default = None if given else kept.get("tracking_uri") or mlflow.get_tracking_uri()
         self._client = mlflow.MlflowClient(given or default)
         self._run_id = _found(self._client, kept.get("run_id")) or _created(self._client, name, config)
-        path.write_text(json.dumps({"run_id": self._run_id, "tracking_uri": default}))
+        files.replace(path, json.dumps({"run_id": self._run_id, "tracking_uri": default}).encode())
         history = self._client.get_metric_history(self._run_id, LAST)
         self.last = max((metric.step for metric in history), default=-1)
         self._waiting: list[Any] = []

@@ -1,4 +1,4 @@
-"""The process of a logger: `python -m jaxpg.run.loggers.sender NAME METRICS CONFIG FOLDER`, started by a Follower.
+"""The process of a logger: `python -m jaxpg.run.loggers.sender NAME RUN`, started by a Follower.
 
 It reads the lines of metrics from their file, from the first one on, and sends those to the service that are newer than
 the last that it has had. So nothing is missing there after a kill, after a failure or where the service was not asked
@@ -26,12 +26,13 @@ LONGEST = 600  # seconds that it goes on after the training has ended
 
 def main(arguments: Sequence[str]) -> int:
     """Sends lines until standard input ends; returns the exit status."""
-    name, metrics, config, folder = arguments
-    told = _only_ours(0)
-    with open(metrics, "rb") as lines, open(Path(folder, f"{name}.log"), "ab") as lock:
+    name, run = arguments[0], Path(arguments[1])
+    folder, told = run / "loggers", _only_ours(0)
+    with (run / "metrics.jsonl").open("rb") as lines, (folder / f"{name}.log").open("ab") as lock:
         try:
             fcntl.flock(lock, fcntl.LOCK_EX)  # the one of the training before it may still be sending
-            logger = importlib.import_module(SERVICES[name]).begin(Path(folder), _name(metrics), _read(config))
+            service = importlib.import_module(SERVICES[name])
+            logger = service.begin(folder, run.resolve().name, _read(run / "config.yaml"))
             follow(logger, lines, told)
             logger.close()
         except Exception as error:  # of any kind: whatever it is, the training says it in one line
@@ -75,14 +76,10 @@ def _only_ours(descriptor: int) -> int:
     return ours
 
 
-def _name(metrics: str) -> str:
-    return Path(metrics).resolve().parent.name
-
-
-def _read(config: str) -> dict:
+def _read(config: Path) -> dict:
     import yaml
 
-    return yaml.safe_load(Path(config).read_text(encoding="utf-8"))
+    return yaml.safe_load(config.read_text(encoding="utf-8"))
 
 
 def _first_line(error: Exception) -> str:

@@ -3,9 +3,14 @@
 from __future__ import annotations
 
 import contextlib
+import os
+import re
+import struct
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
+
+from jaxpg.run import files
 
 FLUSH_INTERVAL = 10.0  # seconds; each flush waits for the disk
 
@@ -26,10 +31,8 @@ class TensorBoard:
 
     def __init__(self, folder: Path, purge_step: int):
         from tensorboardX.proto.event_pb2 import Event, SessionLog
-        from tensorboardX.record_writer import RecordWriter
 
-        folder.mkdir(exist_ok=True)
-        self._file = RecordWriter(str(_after_the_others(folder)))
+        self._file = _Records(folder)
         with self._closed_at_a_failure():
             self._file.write(Event(wall_time=time.time(), file_version="brain.Event:2").SerializeToString())
             start = SessionLog(status=SessionLog.START)
@@ -61,14 +64,34 @@ class TensorBoard:
             raise
 
 
-def _after_the_others(folder: Path) -> Path:
-    """Where the next event file goes: TensorBoard reads them in the order of their names.
+class _Records:
+    """A new file of records, as tensorboardX's RecordWriter writes them; that one takes names for addresses."""
+
+    def __init__(self, folder: Path):
+        with files.opened(folder, make=True) as place:
+            new = os.O_WRONLY | os.O_CREAT | os.O_EXCL
+            self._file = os.fdopen(files.open_in(place, _after_the_others(os.listdir(place)), new), "wb")
+        self.flush, self.close = self._file.flush, self._file.close
+
+    def write(self, content: bytes) -> None:
+        length = struct.pack("<Q", len(content))
+        self._file.write(length + _checksum(length) + content + _checksum(content))
+
+
+def _checksum(content: bytes) -> bytes:
+    from tensorboardX.record_writer import masked_crc32c
+
+    return struct.pack("<I", masked_crc32c(content))
+
+
+def _after_the_others(names: Sequence[str]) -> str:
+    """The next event file's name: TensorBoard reads them in the order of their names.
 
     By tensorboardX's own names, which begin with the time of day, a part of the run would come before an earlier one
     if the clock was set back between them, and then be forgotten.
     """
-    numbers = [int(path.name[7:13]) for path in folder.glob("events_[0-9][0-9][0-9][0-9][0-9][0-9].*")]
-    return folder / f"events_{max(numbers, default=0) + 1:06d}.out.tfevents"
+    numbers = [int(found[1]) for name in names if (found := re.match(r"events_(\d{6})\.", name))]
+    return f"events_{max(numbers, default=0) + 1:06d}.out.tfevents"
 
 
 def _event(values: Mapping[str, float], step: int):

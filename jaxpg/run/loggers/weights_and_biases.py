@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import os
 import secrets
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
+
+from jaxpg.run import files
 
 
 def packages() -> tuple[str, ...]:
@@ -37,7 +40,7 @@ class WeightsAndBiases:
         import wandb
 
         self._kept = folder / "wandb.json"
-        kept = json.loads(self._kept.read_text()) if self._kept.exists() else {"step": -1}
+        kept = json.loads(files.read(self._kept)) if os.path.lexists(self._kept) else {"step": -1}
         self._id = kept.get("id") or os.environ.get("WANDB_RUN_ID") or secrets.token_hex(4)
         self._run = wandb.init(
             id=self._id,
@@ -46,7 +49,7 @@ class WeightsAndBiases:
             config=dict(config),
             allow_val_change=True,  # of options that may change on resume
             project=os.environ.get("WANDB_PROJECT", "jaxpg"),
-            dir=os.environ.get("WANDB_DIR", str(folder)),
+            dir=os.environ.get("WANDB_DIR", _own(folder)),
             settings=_settings(wandb),
         )
         online = self._run.settings.mode == "online"
@@ -62,9 +65,14 @@ class WeightsAndBiases:
         self._run.finish()
 
     def _keep(self, step: int) -> None:
-        unfinished = self._kept.with_suffix(".unfinished")
-        unfinished.write_text(json.dumps({"id": self._id, "step": step}))
-        unfinished.replace(self._kept)
+        files.replace(self._kept, json.dumps({"id": self._id, "step": step}).encode())
+
+
+def _own(folder: Path) -> str:
+    """The name of this folder, for W&B writes in a process of its own; raises OSError where it would follow a link."""
+    if (folder / "wandb").is_symlink():
+        raise OSError(errno.ELOOP, f"wandb: {files.A_LINK}")
+    return str(folder.resolve())
 
 
 def _settings(wandb: Any) -> Any:
