@@ -1,14 +1,16 @@
 """A trained policy as what a robot runs: physical observations in, physical commands out, and nothing of JAX.
 
-    command = limit * clip(squash(f(phi((s - m) / sqrt(v + epsilon)))), -1, 1)
+    command = limit * clip(squash(f(phi(z))), -1, 1),    z = (s - m) / sqrt(v + epsilon)
 
 with the features phi and the network f of the actor, and squash = tanh or nothing. Every format is written from here.
+
+An observation is valid if all |z_i| <= `FARTHEST`: none is NaN, infinite, or so large that floats run out of range. Of
+one that is not valid, or whose action is not finite, every command is 0.
 """
 
 from __future__ import annotations
 
 import functools
-import re
 from collections.abc import Callable
 from typing import NamedTuple
 
@@ -18,10 +20,14 @@ import numpy as np
 
 from envs.base import Interface
 from jaxpg import normalization
+from jaxpg.deploy.names import identifier, printable
 from jaxpg.evaluation import play
+from jaxpg.run.errors import UserError
 from jaxpg.run.policies import StoredPolicy
 from jaxpg.run.schema import Online
+from jaxpg.run.state import Policy
 
+FARTHEST = 1e6  # deviations from training's mean: beyond, an observation is not valid
 NUM_OBSERVATIONS = 10_000  # on which what was written is compared with JAX
 NUM_EPISODES = 50
 FAR = 10.0
@@ -54,7 +60,7 @@ class Controller(NamedTuple):
     """The numbers of a policy, all float32.
 
     Attributes:
-      name: a word, such as "pendulum".
+      name: what files and identifiers begin with, such as "pendulum".
       interface: names, units and limits of observations and commands.
       mean, scale: observations enter as (s - mean) * scale, `[n]`.
       features, order: phi, a name in `jaxpg.features.FEATURES` and its order.
@@ -86,19 +92,24 @@ class Controller(NamedTuple):
         return len(self.layers[-1].bias)
 
 
-def controller(stored: StoredPolicy, origin: dict[str, str]) -> Controller:
+def controller(stored: StoredPolicy, origin: dict[str, str], name: str | None = None) -> Controller:
     """The numbers of a stored policy.
 
     Args:
       stored: the policy.
       origin: as in `Controller`.
+      name: as in `Controller`; None makes one of the task's.
+
+    Raises:
+      UserError: a number is not finite, the environment names more or fewer numbers than there are, or the name is none
+        that files and identifiers can begin with.
     """
     config, network = stored.config, stored.config.network
     dense = stored.policy.params["actor"]["params"]["MLP_0"]
     layers = [dense[f"Dense_{i}"] for i in range(len(dense))]
-    return Controller(
-        name=re.sub(r"\W", "_", config.task),
-        interface=stored.interface,
+    made = Controller(
+        name=identifier(config.task) if name is None else _checked_name(name),
+        interface=_plain(stored.interface),
         mean=np.asarray(stored.policy.normalizer.mean),
         scale=np.asarray(normalization.inverse_deviation(stored.policy.normalizer)),
         features=network.features,
@@ -106,9 +117,42 @@ def controller(stored: StoredPolicy, origin: dict[str, str]) -> Controller:
         layers=[Layer(np.asarray(layer["kernel"]), np.asarray(layer["bias"])) for layer in layers],
         activation=getattr(network, "activation", "tanh"),
         squash=network.squash,
-        origin=origin,
+        origin={key: printable(text) for key, text in origin.items()},
         learner=_learner(stored),
     )
+    _check_numbers(made)
+    return made
+
+
+def _checked_name(name: str) -> str:
+    if name != identifier(name):
+        raise UserError(f"name={name}: C identifiers and files cannot begin so; name={identifier(name)} is possible")
+    return name
+
+
+def _plain(interface: Interface) -> Interface:
+    """The same in tuples of printable texts and of floats, whatever the environment has them in."""
+    names, commands, limits = interface
+    texts = (tuple(printable(str(text)) for text in names) for names in (names, commands))
+    return Interface(*texts, None if limits is None else tuple(float(x) for x in limits))
+
+
+def _check_numbers(made: Controller) -> None:
+    limits = made.interface.limits
+    sizes = {
+        "interface.observations": (len(made.interface.observations), made.observation_size),
+        "interface.commands": (len(made.interface.commands), made.action_size),
+        "interface.limits": (made.action_size if limits is None else len(limits), made.action_size),
+    }
+    for name, (found, expected) in sizes.items():
+        if found != expected:
+            raise UserError(f"the environment's {name} has {found} entries, and must have {expected}")
+    with np.errstate(divide="ignore"):
+        statistics = [made.mean, made.scale, 1 / made.scale]
+    numbers = {"observation statistics": statistics, "network": jax.tree.leaves(made.layers)}
+    for name, arrays in (numbers | {"limits": [limits or 0.0]}).items():
+        if not all(np.all(np.isfinite(array)) for array in arrays):
+            raise UserError(f"the policy cannot leave the library: its {name} holds numbers that are not finite")
 
 
 def _learner(stored: StoredPolicy) -> Learner | None:
@@ -128,9 +172,22 @@ def _learner(stored: StoredPolicy) -> Learner | None:
     )
 
 
+def command_fn(stored: StoredPolicy) -> Callable[[Policy, jax.Array], jax.Array]:
+    """`command(policy, obs)`, `[..., n]` to `[..., m]`, of a policy's parameters: the controller as JAX computes it."""
+
+    def command(policy, obs):
+        action = stored.act(policy, obs)
+        z = (obs - policy.normalizer.mean) * normalization.inverse_deviation(policy.normalizer)
+        valid = jnp.all(jnp.abs(z) <= FARTHEST, axis=-1) & jnp.all(jnp.isfinite(action), axis=-1)
+        return jnp.where(valid[..., None], physical(stored.interface, action), 0.0)
+
+    return command
+
+
 def commanding(stored: StoredPolicy) -> Callable[[jax.Array], jax.Array]:
-    """`command(obs)`, `[..., n]` to `[..., m]`: the controller as JAX computes it."""
-    return lambda obs: physical(stored.interface, stored.act(stored.policy, obs))
+    """`command(obs)`, `[..., n]` to `[..., m]`: as `command_fn`, with the stored parameters."""
+    command = command_fn(stored)
+    return lambda obs: command(stored.policy, obs)
 
 
 def physical(interface: Interface, action: jax.Array) -> jax.Array:
@@ -140,23 +197,39 @@ def physical(interface: Interface, action: jax.Array) -> jax.Array:
 
 
 def observations(stored: StoredPolicy) -> np.ndarray:
-    """What the controller sees, `[10000, n]`: half as it plays itself, half drawn around training's.
+    """What the controller is tried on, `[10000, n]`: what it sees as it plays, and others that are drawn."""
+    seen = played(stored)
+    return np.concatenate([seen, drawn(stored, NUM_OBSERVATIONS - len(seen))])
 
-    Rows further than `FAR` deviations from training's mean, as a controller plays that diverges, are drawn too.
+
+def played(stored: StoredPolicy) -> np.ndarray:
+    """What the controller sees in 5,000 steps of its own, `[<= 5000, n]`.
+
+    Rows further than `FAR` deviations from training's mean, as a controller plays that diverges, are left out.
     """
-    number = NUM_OBSERVATIONS // 2
-    length = number // NUM_EPISODES
-    key_start, key_drawn = jax.random.split(jax.random.key(0))
+    length = NUM_OBSERVATIONS // 2 // NUM_EPISODES
+    keys = jax.random.split(jax.random.key(0), NUM_EPISODES)
 
     @jax.jit
-    def played(policy):
-        act, starts = functools.partial(stored.act, policy), jax.random.split(key_start, NUM_EPISODES)
-        return play(stored.env, act, starts, length, lambda step: (step.before.obs, step.alive))[1]
+    def seen_by(policy):
+        act = functools.partial(stored.act, policy)
+        return play(stored.env, act, keys, length, lambda step: (step.before.obs, step.alive))[1]
 
-    normalizer = jax.tree.map(np.asarray, stored.policy.normalizer)
-    deviation = np.sqrt(normalizer.variance)
-    obs, alive = (np.asarray(x) for x in played(stored.policy))
-    seen = obs[alive]
-    near = np.all(np.abs(seen - normalizer.mean) <= FAR * deviation, axis=1)
-    drawn = np.asarray(jax.random.normal(key_drawn, (NUM_OBSERVATIONS - near.sum(), seen.shape[1])))
-    return np.concatenate([seen[near], normalizer.mean + 2 * deviation * drawn]).astype(np.float32)
+    mean, deviation = _scatter(stored)
+    obs, alive = (np.asarray(x) for x in seen_by(stored.policy))
+    seen = obs[alive].astype(np.float32)
+    last_digits = 1e-6 * np.abs(mean)  # a constant's mean is the constant but for these
+    return seen[np.all(np.abs(seen - mean) <= FAR * deviation + last_digits, axis=1)]
+
+
+def drawn(stored: StoredPolicy, number: int) -> np.ndarray:
+    """Observations around training's mean, with twice its deviation, `[number, n]`."""
+    mean, deviation = _scatter(stored)
+    noise = np.asarray(jax.random.normal(jax.random.key(1), (number, len(mean))))
+    return (mean + 2 * deviation * noise).astype(np.float32)
+
+
+def _scatter(stored: StoredPolicy) -> tuple[np.ndarray, np.ndarray]:
+    """Mean and standard deviation of the observations in training."""
+    normalizer = stored.policy.normalizer
+    return np.asarray(normalizer.mean), np.sqrt(np.asarray(normalizer.variance))

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import contextlib
-import shutil
+import importlib
+import sys
 import tempfile
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -12,8 +13,8 @@ from typing import NamedTuple
 import jax
 import numpy as np
 
-from jaxpg.deploy import c, learning, onnx, stablehlo
-from jaxpg.deploy.controller import Controller, commanding, controller, observations
+from jaxpg.deploy import c, files, learning, onnx, reference, stablehlo
+from jaxpg.deploy.controller import NUM_OBSERVATIONS, Controller, commanding, controller, drawn, played
 from jaxpg.run import folder, policies
 from jaxpg.run.agents import described
 from jaxpg.run.cache import physics_cache
@@ -23,7 +24,8 @@ from jaxpg.run.policies import StoredPolicy
 from jaxpg.run.program import make_networks
 from jaxpg.run.schema import ExportOptions
 
-TOLERANCE = 1e-5
+TOLERANCE = 1e-5  # of the limit
+STEEP = 16  # an error may be so many times what float arithmetic itself costs a network
 LEARNING_TOLERANCE = 1e-4
 
 
@@ -31,60 +33,141 @@ class Format(NamedTuple):
     """A way to write a controller down.
 
     Attributes:
+      check: raises UserError where something is missing that writing or trying out needs.
       write: `write(controller, folder, command) -> paths`; `command` is the controller as JAX computes it.
       load: `load(controller, folder) -> commands`, what was written as a function `[N, n]` to `[N, m]`.
     """
 
+    check: Callable[[], object]
     write: Callable[[Controller, Path, Callable], list[Path]]
     load: Callable[[Controller, Path], Callable[[np.ndarray], np.ndarray]]
 
 
+def _check_packages(form: str, *names: str) -> None:
+    """Raises UserError where one of the packages cannot be loaded."""
+    for name in names:
+        try:
+            importlib.import_module(name)
+        except ImportError:
+            install = f"{sys.executable} -m pip install {' '.join(names)}"
+            raise UserError(f"format={form} needs {name}, which cannot be loaded: {install}") from None
+
+
 FORMATS = {
-    "c": Format(lambda control, place, _: c.write(control, place), c.load),
-    "onnx": Format(lambda control, place, _: onnx.write(control, place), onnx.load),
-    "stablehlo": Format(stablehlo.write, stablehlo.load),
+    "c": Format(c.compiler, lambda control, place, _: c.write(control, place), c.load),
+    "onnx": Format(
+        lambda: _check_packages("onnx", "onnx", "onnxruntime"),
+        lambda control, place, _: onnx.write(control, place),
+        onnx.load,
+    ),
+    "stablehlo": Format(lambda: _check_packages("stablehlo", "flatbuffers"), stablehlo.write, stablehlo.load),
 }
 
 
+class Trial(NamedTuple):
+    """What a controller is tried on.
+
+    Attributes:
+      obs: observations, `[N, n]`.
+      exact: the commands for them in float64, `[N, m]`.
+      unit: what errors are counted in, `[m]`.
+      tolerance: the largest error allowed.
+    """
+
+    obs: np.ndarray
+    exact: np.ndarray
+    unit: np.ndarray
+    tolerance: float
+
+    def error(self, commands: np.ndarray) -> float:
+        return reference.largest_error(commands, self.exact, self.unit)
+
+
+def trial(control: Controller, obs: np.ndarray) -> Trial:
+    """A trial on observations `[N, n]`.
+
+    The tolerance is `TOLERANCE`, or `STEEP` times what float32 costs in numpy where that is more: floats come no closer
+    where a network is steep.
+    """
+    exact = reference.commands(control, obs)
+    unit, _ = reference.units(control, exact)
+    return Trial(obs, exact, unit, max(TOLERANCE, STEEP * reference.rounding(control, obs, exact)))
+
+
 def export(options: ExportOptions, say: Callable[[str], None]) -> None:
-    """Writes the policy of a run in the formats asked for, each compared with JAX; all of them or nothing.
+    """Writes the policy of a run in the formats asked for, each compared with its formula; all of them or nothing.
 
     Args:
       options: of the command.
       say: takes lines of what was written.
 
     Raises:
-      UserError: no such run, policy or compiler; a package is missing; `out` is no folder; or what was written
-        commands something else than JAX does.
+      UserError: no such run, policy or compiler; a package is missing; `out` is no folder, or holds files of these
+        names that no export has left so; or what was written commands something else than the formula.
     """
-    out = Path(options.out or Path(options.run) / "export")
-    if out.exists() and not out.is_dir():
-        raise UserError(f"out={out}: there is a file of that name")
+    formats = FORMATS if options.format == "all" else {options.format: FORMATS[options.format]}
+    for way in formats.values():
+        way.check()
+    out = _destination(options)
     with physics_cache(True):
         stored = policies.load(options.run, options.checkpoint, options.agent)
-    control, command = controller(stored, origin(options, stored)), jax.jit(commanding(stored))
-    obs = observations(stored)
-    expected = np.asarray(command(obs), np.float64)
-    say(f"{control.origin['policy']}, {control.observation_size} observations to {control.action_size} commands")
-    formats = FORMATS if options.format == "all" else {options.format: FORMATS[options.format]}
+    control, command = controller(stored, origin(options, stored), options.name), jax.jit(commanding(stored))
+    seen = played(stored)
+    tried = trial(control, np.concatenate([seen, drawn(stored, NUM_OBSERVATIONS - len(seen))]))
+    _say_what_is_tried(control, tried, len(seen), say)
+    say(f"{'jax':<10} error {_checked(control, 'jax', tried, np.asarray(command(tried.obs))):.1e} at most")
     with tempfile.TemporaryDirectory() as place:
         written = []
         for name, way in formats.items():
             paths = way.write(control, Path(place), command)
-            difference = largest_difference(way.load(control, Path(place))(obs), expected)
-            if not difference <= TOLERANCE:
-                raise UserError(
-                    f"format={name}: its commands differ from JAX's by {difference:.1e}, more than {TOLERANCE:.0e}; "
-                    f"nothing is written"
-                )
+            error = _checked(control, f"format={name}", tried, way.load(control, Path(place))(tried.obs))
             written += paths
-            files = " ".join(str(out / path.name) for path in paths)
-            say(f"{name:<10} {files}")
-            say(f"{'':<10} differs from JAX by {difference:.1e} at most, {len(obs):,} observations")
+            say(f"{name:<10} error {error:.1e} at most: {' '.join(str(out / path.name) for path in paths)}")
             if name == "c" and control.learner:
                 apart = _learning_difference(stored, control, Path(place))
-                say(f"{'':<10} and in learning by {apart:.1e} at most, {learning.NUM_STEPS:,} updates")
-        _move(written, out)
+                say(f"{'':<10} in learning differs from JAX by {apart:.1e} at most, {learning.NUM_STEPS:,} updates")
+        if not options.overwrite:
+            files.check_replaceable([path.name for path in written], out)
+        files.move(written, out)
+
+
+def _destination(options: ExportOptions) -> Path:
+    """The folder to write into.
+
+    Raises:
+      UserError: a file is there; or a link, where the user has not named it: a run folder may be somebody else's.
+    """
+    inside = Path(options.run) / "export"
+    if options.out is None and inside.is_symlink():
+        raise UserError(f"{inside} is a link, which is not followed: say out=DIR")
+    out = Path(options.out or inside)
+    if out.exists() and not out.is_dir():
+        raise UserError(f"out={out}: there is a file of that name")
+    return out
+
+
+def _say_what_is_tried(control: Controller, tried: Trial, num_played: int, say: Callable[[str], None]) -> None:
+    say(f"{control.origin['policy']}, {control.observation_size} observations to {control.action_size} commands")
+    _, unit = reference.units(control, tried.exact)
+    say(
+        f"{'tried':<10} on {len(tried.obs):,} observations, {num_played:,} of them played and the others drawn; "
+        f"errors in units of {unit}, against float64"
+    )
+
+
+def _checked(control: Controller, what: str, tried: Trial, commands: np.ndarray) -> float:
+    """The largest error of the commands.
+
+    Raises:
+      UserError: it is too large.
+    """
+    error = tried.error(commands)
+    if not error <= tried.tolerance:
+        raise UserError(
+            f"{what}: its commands differ from the formula's by {error:.1e} of "
+            f"{reference.units(control, tried.exact)[1]}, more than {tried.tolerance:.0e}; nothing is written"
+        )
+    return error
 
 
 def _learning_difference(stored: StoredPolicy, control: Controller, place: Path) -> float:
@@ -118,14 +201,15 @@ def as_written(stored: StoredPolicy, form: str) -> Iterator[StoredPolicy]:
       UserError: a compiler or a package is missing.
     """
     control, way = controller(stored, {}), FORMATS[form]
+    way.check()
     limits = control.interface.limits
+    unit = np.ones(control.action_size) if limits is None else np.where(limits, limits, 1.0)  # a limit of 0 commands 0
     with tempfile.TemporaryDirectory() as place:
         way.write(control, Path(place), commanding(stored))
         commands = way.load(control, Path(place))
 
         def action(obs):
-            command = commands(np.asarray(obs, np.float32))
-            return np.asarray(command if limits is None else command / np.array(limits), np.float32)
+            return np.asarray(commands(np.asarray(obs, np.float32)) / unit, np.float32)
 
         def act(policy, obs):
             return jax.pure_callback(action, jax.ShapeDtypeStruct((len(obs), control.action_size), np.float32), obs)
@@ -151,12 +235,3 @@ def largest_difference(found: np.ndarray, expected: np.ndarray) -> float:
     1.0
     """
     return float(np.max(np.abs(found - expected) / np.maximum(1, np.abs(expected))))
-
-
-def _move(paths: list[Path], out: Path) -> None:
-    try:
-        out.mkdir(parents=True, exist_ok=True)
-        for path in paths:
-            shutil.copyfile(path, out / path.name)
-    except OSError as error:
-        raise UserError(f"out={out}: cannot be written ({error.strerror})") from error

@@ -14,7 +14,8 @@ CODE = """
      z_theta = gamma lambda_actor z_theta + {discounted} grad log N(u; W'x + b, sigma^2)
      w += alpha_critic delta z_w,    theta += alpha_actor delta z_theta
 
-   of the parameters theta = (W, b{sigma}). Nothing bounds a step: try new step sizes in a simulation first. */
+   of the parameters theta = (W, b{sigma}). Nothing bounds a step: try new step sizes in a simulation first. But numbers
+   that are not finite are never learned from. */
 #define POLICY_FEATURES {size}
 
 typedef struct {{
@@ -48,16 +49,17 @@ static inline void policy_begin(policy_learner *learner) {{
     policy_forget(learner);
 }}
 
-/* Draws u = mean + sigma noise, of independent standard normal numbers of the caller's, and the command made of it. */
-static inline void policy_sample(const policy_learner *learner, const policy_real observation[POLICY_OBSERVATIONS],
-                                 const policy_real noise[POLICY_COMMANDS], policy_real u[POLICY_COMMANDS],
-                                 policy_real command[POLICY_COMMANDS]) {{
+/* Draws u = mean + sigma noise, of independent standard normal numbers of the caller's, and the command made of it.
+   Returns what policy_command does. */
+static inline int policy_sample(const policy_learner *learner, const policy_real observation[POLICY_OBSERVATIONS],
+                                const policy_real noise[POLICY_COMMANDS], policy_real u[POLICY_COMMANDS],
+                                policy_real command[POLICY_COMMANDS]) {{
     const policy_parameters *p = &learner->parameters;
     policy_real x[POLICY_FEATURES];
-    policy_features(observation, x);
+    const int valid = policy_features(observation, x);
     policy_layer(p->weight, p->bias, POLICY_FEATURES, POLICY_COMMANDS, x, u);
     for (int j = 0; j < POLICY_COMMANDS; j++) u[j] += POLICY_F(exp)(p->log_sigma[j]) * noise[j];
-    policy_limited(u, command);
+    return valid ? policy_limited(u, command) : policy_no_command(command);
 }}
 
 static inline policy_real policy_value(const policy_learner *learner, const policy_real *x) {{
@@ -68,21 +70,28 @@ static inline policy_real policy_value(const policy_learner *learner, const poli
 
 /* Learns from one step. `terminated`: the task has ended, and nothing more will be earned; `truncated`: the episode is
    cut, by a time limit say, and the next step begins another one. `next_observation` is the last one of the episode in
-   either case. */
-static inline void policy_update(policy_learner *learner, const policy_real observation[POLICY_OBSERVATIONS],
-                                 const policy_real u[POLICY_COMMANDS], policy_real reward,
-                                 const policy_real next_observation[POLICY_OBSERVATIONS], int terminated,
-                                 int truncated) {{
+   either case. Returns 1; or 0, having learned nothing and forgotten the traces, if u or the TD error is not finite, or
+   an observation is not valid (the next one does not matter where the task has ended). */
+static inline int policy_update(policy_learner *learner, const policy_real observation[POLICY_OBSERVATIONS],
+                                const policy_real u[POLICY_COMMANDS], policy_real reward,
+                                const policy_real next_observation[POLICY_OBSERVATIONS], int terminated,
+                                int truncated) {{
     const policy_real gamma = policy_constants[0];
     const policy_real keep_actor = gamma * policy_constants[1], keep_critic = gamma * policy_constants[2];
     policy_parameters *p = &learner->parameters, *z = &learner->traces;
     policy_real x[POLICY_FEATURES], next[POLICY_FEATURES], mean[POLICY_COMMANDS];
-    policy_features(observation, x);
-    policy_features(next_observation, next);
+    int valid = policy_features(observation, x);
+    valid &= policy_features(next_observation, next) || terminated;
     policy_layer(p->weight, p->bias, POLICY_FEATURES, POLICY_COMMANDS, x, mean);
     const policy_real bootstrap = terminated ? 0 : gamma * policy_value(learner, next);
     const policy_real delta = policy_constants[5] * reward + bootstrap - policy_value(learner, x);
     const policy_real step_actor = policy_constants[3] * delta, step_critic = policy_constants[4] * delta;
+    valid &= policy_finite(delta);
+    for (int j = 0; j < POLICY_COMMANDS; j++) valid &= policy_finite(u[j]);
+    if (!valid) {{
+        policy_forget(learner);
+        return 0;
+    }}
 
     for (int i = 0; i < POLICY_FEATURES; i++) {{
         z->value_weight[i] = keep_critic * z->value_weight[i] + x[i];
@@ -103,6 +112,7 @@ static inline void policy_update(policy_learner *learner, const policy_real obse
     }}
     learner->factor *= {factor};
     if (terminated || truncated) policy_forget(learner);
+    return 1;
 }}
 """
 

@@ -1,4 +1,7 @@
-"""A controller as an ONNX model: `observation` `[batch, n]` to `command` `[batch, m]`, for any batch."""
+"""A controller as an ONNX model: `observation` `[batch, n]` to `command` `[batch, m]`, for any batch.
+
+The commands of a row are 0 where its observation is not valid, as `jaxpg.deploy.controller` has it.
+"""
 
 from __future__ import annotations
 
@@ -9,12 +12,13 @@ from typing import Any
 
 import numpy as np
 
-from jaxpg.deploy.controller import Controller
+from jaxpg.deploy.controller import FARTHEST, Controller
+from jaxpg.deploy.files import NO_SEAL, sealed
 from jaxpg.features import BOUND
-from jaxpg.run.errors import UserError
 
 OPSET = 18  # of 2022: what runtimes of robots have learned since then
 IR_VERSION = 8  # which goes with it
+FLOAT = 1  # onnx.TensorProto.FLOAT
 
 
 class Graph:
@@ -41,15 +45,9 @@ class Graph:
 
 
 def write(controller: Controller, folder: Path) -> list[Path]:
-    """Writes NAME.onnx into `folder`; returns its path.
+    """Writes NAME.onnx into `folder`; returns its path."""
+    from onnx import TensorProto, checker, helper, numpy_helper
 
-    Raises:
-      UserError: onnx is not installed.
-    """
-    try:
-        from onnx import TensorProto, checker, helper, numpy_helper, save
-    except ImportError:
-        raise UserError("format=onnx needs onnx and onnxruntime: pip install onnx onnxruntime") from None
     graph = Graph(helper, numpy_helper)
     _command(graph, controller)
     values = [
@@ -60,24 +58,18 @@ def write(controller: Controller, folder: Path) -> list[Path]:
     model = helper.make_model(made, opset_imports=[helper.make_opsetid("", OPSET)], producer_name="jaxpg")
     model.ir_version = IR_VERSION
     names, commands, limits = controller.interface
-    about = {"observations": "; ".join(names), "commands": "; ".join(commands), "limits": str(limits)}
+    about = {"observations": "; ".join(names), "commands": "; ".join(commands), "limits": str(limits), "seal": NO_SEAL}
     helper.set_model_props(model, controller.origin | about)
     checker.check_model(model, full_check=True)
     path = folder / f"{controller.name}.onnx"
-    save(model, path)
+    path.write_bytes(sealed(model.SerializeToString()))
     return [path]
 
 
 def load(controller: Controller, folder: Path) -> Callable[[np.ndarray], np.ndarray]:
-    """The written controller, `[N, n]` to `[N, m]`, in onnxruntime.
+    """The written controller, `[N, n]` to `[N, m]`, in onnxruntime."""
+    import onnxruntime
 
-    Raises:
-      UserError: onnxruntime is not installed.
-    """
-    try:
-        import onnxruntime
-    except ImportError:
-        raise UserError("format=onnx is tried out by onnxruntime: pip install onnxruntime") from None
     path = str(folder / f"{controller.name}.onnx")
     session = onnxruntime.InferenceSession(path, providers=["CPUExecutionProvider"])
     return lambda obs: session.run(["command"], {"observation": obs})[0]
@@ -92,11 +84,20 @@ def _command(graph: Graph, controller: Controller) -> None:
     action = _layer(graph, x, controller.layers[-1])
     if controller.squash:
         action = graph.node("Tanh", action)
-    if controller.interface.limits is None:
-        graph.node("Identity", action, name="command")
-    else:
-        action = graph.node("Clip", action, graph.constant(-1), graph.constant(1))
-        graph.node("Mul", action, graph.constant(controller.interface.limits), name="command")
+    limited = action if controller.interface.limits is None else _limited(graph, action, controller.interface.limits)
+    valid = graph.node("And", _within(graph, z, FARTHEST), _within(graph, action, np.finfo(np.float32).max))
+    graph.node("Where", valid, limited, graph.constant(0), name="command")
+
+
+def _limited(graph: Graph, action: str, limits: tuple[float, ...]) -> str:
+    return graph.node("Mul", graph.node("Clip", action, graph.constant(-1), graph.constant(1)), graph.constant(limits))
+
+
+def _within(graph: Graph, x: str, bound: float) -> str:
+    """Whether all |x| of a row are at most this, `[batch, 1]`; NaN is not."""
+    each = graph.node("LessOrEqual", graph.node("Abs", x), graph.constant(bound))
+    least = graph.node("ReduceMin", graph.node("Cast", each, to=FLOAT), graph.constant([1], np.int64), keepdims=1)
+    return graph.node("Greater", least, graph.constant(0.5))
 
 
 def _layer(graph: Graph, x: str, layer: Any) -> str:

@@ -1,7 +1,11 @@
-"""A controller as a StableHLO program, which `jax.export` reads without jaxpg: `[batch, n]` to `[batch, m]`."""
+"""A controller as a StableHLO program, which `jax.export` reads without jaxpg: `[1, n]` to `[1, m]`.
+
+The batch is fixed: of what newer versions of jax write, older ones run programs of fixed sizes alone.
+"""
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Callable
 from pathlib import Path
 
@@ -10,6 +14,7 @@ import jax.export  # not part of `import jax`
 import numpy as np
 
 from jaxpg.deploy.controller import Controller
+from jaxpg.deploy.files import NO_SEAL, sealed
 
 PLATFORMS = ("cpu", "cuda", "tpu")
 
@@ -22,16 +27,17 @@ def write(controller: Controller, folder: Path, command: Callable[[jax.Array], j
       folder: where to.
       command: the controller as JAX computes it.
     """
-    (batch,) = jax.export.symbolic_shape("batch")
-    shape = jax.ShapeDtypeStruct((batch, controller.observation_size), np.float32)
+    shape = jax.ShapeDtypeStruct((1, controller.observation_size), np.float32)
     exported = jax.export.export(jax.jit(command), platforms=PLATFORMS)(shape)
+    exported = dataclasses.replace(exported, fun_name=f"{controller.name} {NO_SEAL}")
     program, text = (folder / f"{controller.name}.{ending}" for ending in ("stablehlo", "mlir"))
-    program.write_bytes(exported.serialize())
-    text.write_text(exported.mlir_module(), encoding="utf-8")
+    program.write_bytes(sealed(exported.serialize()))
+    text.write_bytes(sealed(f"// {NO_SEAL}\n{exported.mlir_module()}".encode()))
     return [program, text]
 
 
 def load(controller: Controller, folder: Path) -> Callable[[np.ndarray], np.ndarray]:
-    """The written controller, `[N, n]` to `[N, m]`."""
+    """The written controller, `[N, n]` to `[N, m]`: called for one row after the other."""
     exported = jax.export.deserialize(bytearray((folder / f"{controller.name}.stablehlo").read_bytes()))
-    return lambda obs: np.asarray(exported.call(obs))
+    rows = jax.jit(lambda obs: jax.lax.map(lambda row: exported.call(row[None])[0], obs))
+    return lambda obs: np.asarray(rows(obs))

@@ -220,6 +220,8 @@ class ExportOptions:
         "c", "a C99 header, an ONNX model, a StableHLO program", choices=("c", "onnx", "stablehlo", "all")
     )
     out: str | None = option(None, "folder to write into [default: export in the run folder]")
+    name: str | None = option(None, "what files and C identifiers begin with [default: the environment's name]")
+    overwrite: bool = option(False, "replace files there that no export has written, or that were changed since")
     checkpoint: str = option(
         "best", "the best policy by the evaluations while training, or the last", choices=("best", "last")
     )
