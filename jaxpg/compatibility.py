@@ -19,9 +19,7 @@ def check_jaxlib(version: str) -> None:
     >>> check_jaxlib("0.10.1")
     """
     if version in WRONG_SUMS:
-        raise ImportError(
-            f"jaxlib {version} computes wrong sums on a CPU; install another one: pip install 'jax!=0.10.2,!=0.11.*'"
-        )
+        raise ImportError(f"jaxlib {version} computes wrong sums on a CPU; install another one, 'jax!=0.10.2,!=0.11.*'")
 
 
 def may_deadlock(version: str) -> bool:

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from envs.hints import pip_install
 from jaxpg.deploy.controller import Controller
 from jaxpg.features import BOUND
 from jaxpg.run.errors import UserError
@@ -49,7 +50,7 @@ def write(controller: Controller, folder: Path) -> list[Path]:
     try:
         from onnx import TensorProto, checker, helper, numpy_helper, save
     except ImportError:
-        raise UserError("format=onnx needs onnx and onnxruntime: pip install onnx onnxruntime") from None
+        raise UserError(f"format=onnx needs onnx and onnxruntime: {pip_install('onnx', 'onnxruntime')}") from None
     graph = Graph(helper, numpy_helper)
     _command(graph, controller)
     values = [
@@ -77,7 +78,7 @@ def load(controller: Controller, folder: Path) -> Callable[[np.ndarray], np.ndar
     try:
         import onnxruntime
     except ImportError:
-        raise UserError("format=onnx is tried out by onnxruntime: pip install onnxruntime") from None
+        raise UserError(f"format=onnx is tried out by onnxruntime: {pip_install('onnxruntime')}") from None
     path = str(folder / f"{controller.name}.onnx")
     session = onnxruntime.InferenceSession(path, providers=["CPUExecutionProvider"])
     return lambda obs: session.run(["command"], {"observation": obs})[0]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import importlib
+import shlex
 import time
 from collections.abc import Callable, Iterable, Mapping
 from signal import Signals
@@ -12,6 +13,7 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
+from envs.hints import python
 from jaxpg.run import agents, figures, folder, lock, memory, results
 from jaxpg.run import config as configuration
 from jaxpg.run.cache import compilation_cache, physics_cache
@@ -323,5 +325,5 @@ def _closing_rows(
         "speed": f"{rate:,.0f} steps/s",
         "time": f"{compile_seconds:.1f} s compiling, {training_seconds:.1f} s training",
         "run folder": str(run_folder.path),
-        "evaluate it": f"python -m jaxpg.evaluate run={run_folder.path}",
+        "evaluate it": f"{python()} -m jaxpg.evaluate run={shlex.quote(str(run_folder.path))}",
     }
