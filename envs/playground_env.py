@@ -18,6 +18,7 @@ from typing import Any
 import jax
 
 from envs.base import State
+from envs.hints import pip_install
 from envs.options import OptionError, option, unknown
 from envs.scenes import Scene
 
@@ -101,7 +102,7 @@ def make(config: PlaygroundConfig) -> Playground:
         behind the present MuJoCo.
     """
     if importlib.util.find_spec("mujoco_playground") is None:
-        raise OptionError(["env=playground needs MuJoCo Playground: pip install playground"])
+        raise OptionError([f"env=playground needs MuJoCo Playground: {pip_install('playground')}"])
     # What its dependencies say as they are imported helps nobody here.
     with warnings.catch_warnings(), contextlib.redirect_stdout(io.StringIO()):
         warnings.simplefilter("ignore")

@@ -2,21 +2,46 @@
 
 from __future__ import annotations
 
+import argparse
 import json
 import subprocess
 import sys
 import time
 from pathlib import Path
-from typing import Any
+from typing import Any, NoReturn
 
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from jaxpg.run.errors import UserError
 from jaxpg.run.figures import draw_curve, series
 from jaxpg.run.folder import RunFolder, read_metrics
 from jaxpg.run.statistics import bootstrap_interval, interquartile_mean
 
 RESULTS = Path(__file__).parent / "results"
+
+
+class Parser(argparse.ArgumentParser):
+    """Of an experiment's arguments. `--help` prints what the script says of itself; a mistake is one line.
+
+    Args:
+      doc: the script's docstring.
+    """
+
+    def __init__(self, doc: str):
+        form = argparse.RawDescriptionHelpFormatter
+        super().__init__(description=doc, formatter_class=form, allow_abbrev=False)
+
+    def error(self, message: str) -> NoReturn:
+        """Raises UserError, of which `run_command` makes the line."""
+        raise UserError(f"{message}; {self.prog} --help says more")
+
+
+def count(text: str) -> int:
+    """A whole number from 1 on, as the type of an argument."""
+    if not (text.isascii() and text.isdigit() and int(text)):
+        raise argparse.ArgumentTypeError(f"{text}: expected a whole number, at least 1")
+    return int(text)
 
 
 def train(folder: Path, *arguments: str, environment: dict[str, str] | None = None) -> float:

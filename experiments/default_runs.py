@@ -13,11 +13,14 @@ from __future__ import annotations
 
 import itertools
 import os
-import sys
 import tempfile
+from collections.abc import Sequence
 from pathlib import Path
 
-from commands import evaluate, train, write_json
+from commands import Parser, evaluate, train, write_json
+
+from envs.options import unknown
+from jaxpg.run.errors import run_command
 
 PENDULUM_RUNS = {"default": ((), 10), "TD": (("algo=td",), 5), "TD(0)": (("algo=td", "algo.lambda_=0"), 5)}  # seeds
 ARM_RUNS = [{"seed": str(seed)} for seed in range(3)] + [
@@ -56,12 +59,21 @@ def arm(folder: Path) -> None:
     write_json("default_runs_arm.json", rows)
 
 
-def main(tasks: list[str]) -> None:
+TASKS = {"pendulum": pendulum, "arm": arm}
+
+
+def main(arguments: Sequence[str]) -> None:
+    parser = Parser(__doc__)
+    parser.add_argument("tasks", nargs="*", metavar="TASK", help=" or ".join(TASKS))
+    tasks = parser.parse_args(arguments).tasks or list(TASKS)
+    for task in tasks:
+        if task not in TASKS:
+            parser.error(unknown("task", task, TASKS))
     with tempfile.TemporaryDirectory() as folder:
         os.environ["XDG_CACHE_HOME"] = folder  # the first run of each kind compiles, whatever was run before
-        for task in tasks or ["pendulum", "arm"]:
-            {"pendulum": pendulum, "arm": arm}[task](Path(folder))
+        for task in tasks:
+            TASKS[task](Path(folder))
 
 
 if __name__ == "__main__":
-    main(sys.argv[1:])
+    run_command(main)

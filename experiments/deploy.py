@@ -17,18 +17,19 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
 import jax
 import numpy as np
-from commands import evaluate, train, write_json
+from commands import Parser, evaluate, train, write_json
 
 from jaxpg.deploy import c, onnx
 from jaxpg.deploy.controller import commanding, controller, observations
 from jaxpg.deploy.export import FORMATS, largest_difference
 from jaxpg.run import policies
+from jaxpg.run.errors import run_command
 
 TASK = "pendulum"
 POLICIES = ("jax", "c", "onnx")
@@ -94,7 +95,8 @@ def in_c(name: str, folder: Path) -> dict[str, Any]:
     }
 
 
-def main() -> None:
+def main(arguments: Sequence[str] = ()) -> None:
+    Parser(__doc__).parse_args(arguments)
     with tempfile.TemporaryDirectory() as place:
         run, folder = Path(place) / "run", Path(place)
         train(run, f"env={TASK}")
@@ -123,4 +125,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    run_command(main)

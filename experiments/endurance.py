@@ -9,19 +9,21 @@ and writes results/endurance.json and results/endurance.png.
 
 from __future__ import annotations
 
-import argparse
 import signal
 import subprocess
 import sys
 import tempfile
 import time
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from commands import write_figure, write_json
+from commands import Parser, write_figure, write_json
 from matplotlib.figure import Figure
 
+from jaxpg.run.config import compose
+from jaxpg.run.errors import run_command
 from jaxpg.run.folder import RunFolder, read_metrics
 
 WARM_UP = 1 / 60  # of the time; compiling and the first evaluation and checkpoint are over by then
@@ -75,22 +77,21 @@ def draw(result: dict[str, Any]) -> Figure:
     return figure
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+def main(arguments: Sequence[str]) -> None:
+    parser = Parser(__doc__)
     parser.add_argument("--seconds", type=float, default=3600)
     parser.add_argument("options", nargs="*", metavar="OPTION=VALUE")
-    arguments = parser.parse_args()
+    given = parser.parse_args(arguments)
+    compose([f"env={TASK}", *given.options])  # a mistake in one of them is said here
     with tempfile.TemporaryDirectory() as folder:
-        result = train(Path(folder) / "run", arguments.seconds, arguments.options)
+        result = train(Path(folder) / "run", given.seconds, given.options)
     when, memory = np.array(result["seconds"]), np.array(result["resident, MB"])
-    first, *_, last = memory[when >= WARM_UP * arguments.seconds]
-    print(
-        f"{result['steps']:,} steps; {first:.1f} MB after {WARM_UP * arguments.seconds:.0f} s, {last:.1f} MB at the end"
-    )
+    first, *_, last = memory[when >= WARM_UP * given.seconds]
+    print(f"{result['steps']:,} steps; {first:.1f} MB after {WARM_UP * given.seconds:.0f} s, {last:.1f} MB at the end")
     print(f"largest {memory.max():.1f} MB; ended {result['SIGTERM to exit, s']} s after SIGTERM")
     write_json("endurance.json", result)
     write_figure("endurance.png", draw(result))
 
 
 if __name__ == "__main__":
-    main()
+    run_command(main)

@@ -13,9 +13,13 @@ Writes results/estimator_table.json and prints it as a table.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
-from commands import write_json
+from commands import Parser, write_json
 from linear_quadratic import closed_form, ladder, setting, study
+
+from jaxpg.run.errors import run_command
 
 NUM_BATCHES = 20
 SIZES = (1, 3)
@@ -37,7 +41,8 @@ def rows(n: int) -> dict[str, dict[str, float]]:
     }
 
 
-def main() -> None:
+def main(arguments: Sequence[str] = ()) -> None:
+    Parser(__doc__).parse_args(arguments)
     by_size = {n: rows(n) for n in SIZES}
     table = {name: {f"n = {n}": by_size[n][name] for n in SIZES} for name in by_size[SIZES[0]]}
     write_json("estimator_table.json", table)
@@ -49,4 +54,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    run_command(main)

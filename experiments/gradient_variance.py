@@ -14,10 +14,11 @@ Writes results/gradient_variance.png and results/gradient_variance.json.
 from __future__ import annotations
 
 import functools
+from collections.abc import Sequence
 
 import jax
 import numpy as np
-from commands import write_figure, write_json
+from commands import Parser, write_figure, write_json
 from linear_quadratic import (
     UNBIASED,
     Played,
@@ -31,6 +32,8 @@ from linear_quadratic import (
     td_lambda_with_wrong_critic,
 )
 from matplotlib.figure import Figure
+
+from jaxpg.run.errors import run_command
 
 VARIABLES = 3
 NUM_EPISODES = 204_800
@@ -64,7 +67,8 @@ def bias_and_variance(lambda_: float) -> tuple[float, float]:
     return float(np.sum(bias**2) / np.sum(exact**2)), float(variance / np.sum(exact**2))
 
 
-def main() -> None:
+def main(arguments: Sequence[str] = ()) -> None:
+    Parser(__doc__).parse_args(arguments)
     errors = {baseline: [error(baseline, size) for size in BATCH_SIZES] for baseline in BASELINES}
     bias, variance = np.array([bias_and_variance(lambda_) for lambda_ in LAMBDAS]).T
     figure = Figure(figsize=(11, 4.2), layout="constrained")
@@ -92,4 +96,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    run_command(main)

@@ -17,11 +17,12 @@ Writes results/lesson_toy.png and results/lesson_toy.json.
 from __future__ import annotations
 
 import json
+from collections.abc import Sequence
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from commands import write_figure, write_json
+from commands import Parser, write_figure, write_json
 from matplotlib.figure import Figure
 
 from envs.quadratic import LinearQuadratic, Policy, QuadraticConfig, best_policy, chain, objective
@@ -30,6 +31,7 @@ from jaxpg.estimators import reinforce
 from jaxpg.networks import linear_mean
 from jaxpg.rollout import rollout
 from jaxpg.run.config import compose
+from jaxpg.run.errors import run_command
 from jaxpg.run.program import make_algorithm, make_env, plan
 from jaxpg.training import initial_state, train_scan
 from jaxpg.vector_env import vectorize
@@ -101,7 +103,8 @@ def state_of(theta: np.ndarray, best: float) -> dict[str, float]:
     }
 
 
-def main() -> None:
+def main(arguments: Sequence[str] = ()) -> None:
+    Parser(__doc__).parse_args(arguments)
     problem = chain(QuadraticConfig())
     best = -objective(problem, best_policy(problem, SIGMA))
     axes = (figure := Figure(figsize=(7, 4.2), layout="constrained")).subplots()
@@ -137,4 +140,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    run_command(main)

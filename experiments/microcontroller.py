@@ -18,7 +18,6 @@ Writes results/microcontroller.json.
 
 from __future__ import annotations
 
-import argparse
 import json
 import shutil
 import subprocess
@@ -30,7 +29,7 @@ from typing import Any, NamedTuple
 
 import jax
 import numpy as np
-from commands import train, write_json
+from commands import Parser, train, write_json
 
 from jaxpg.deploy import c, learning
 from jaxpg.deploy.controller import Controller, commanding, controller, observations
@@ -239,8 +238,7 @@ def a_learner(stored: StoredPolicy, control: Controller, folder: Path) -> dict[s
 
 
 def main(arguments: Sequence[str]) -> int:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.parse_args(arguments)
+    Parser(__doc__).parse_args(arguments)
     check_tools()
     result: dict[str, Any] = {"tools": [_output(tool, "--version").splitlines()[0] for tool in (COMPILER, QEMU)]}
     runs = {"controller": (a_controller, ("env=pendulum",)), "learner": (a_learner, ("env=pendulum", "algo=online"))}

@@ -16,14 +16,16 @@ Writes results/online_pendulum.png and results/online_pendulum.json.
 from __future__ import annotations
 
 import json
+from collections.abc import Sequence
 
 import jax
 import numpy as np
-from commands import write_figure, write_json
+from commands import Parser, write_figure, write_json
 from matplotlib.figure import Figure
 
 from jaxpg.run.agents import agents_of
 from jaxpg.run.config import compose
+from jaxpg.run.errors import run_command
 from jaxpg.run.figures import draw_curve
 from jaxpg.run.program import make_algorithm, make_env, plan
 from jaxpg.run.statistics import interquartile_mean
@@ -50,7 +52,8 @@ def returns(*options: str) -> tuple[np.ndarray, np.ndarray]:
     return ends[1:] * schedule.steps_per_update, total / np.maximum(episodes, 1)
 
 
-def main() -> None:
+def main(arguments: Sequence[str] = ()) -> None:
+    Parser(__doc__).parse_args(arguments)
     figure = Figure(figsize=(11, 4.2), layout="constrained")
     left, right = figure.subplots(1, 2)
     summary = {"curves": {}, "step sizes": {}}
@@ -87,4 +90,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    run_command(main)

@@ -16,11 +16,10 @@ and to compile, and temporary memory in bytes for each environment.
 
 from __future__ import annotations
 
-import argparse
 import os
 import statistics
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import jax
@@ -28,11 +27,12 @@ import jax.numpy as jnp
 import mujoco
 import mujoco.rollout
 import numpy as np
-from commands import write_json
+from commands import Parser, count, write_json
 
 import envs
 from envs.base import ASSETS
 from envs.physics import compile_step, load_spec
+from jaxpg.run.errors import run_command
 
 SECONDS = 0.3  # that one measurement lasts, at least
 MJX_PANDAS = 1  # environments up to which mjx.step of the seven-joint arm is measured
@@ -161,11 +161,11 @@ def show(row: dict[str, Any]) -> None:
     )
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--envs", type=int, nargs="+", default=[1, 64, 1024, 16_384])
-    parser.add_argument("--repeats", type=int, default=7)
-    options = parser.parse_args()
+def main(arguments: Sequence[str]) -> None:
+    parser = Parser(__doc__)
+    parser.add_argument("--envs", type=count, nargs="+", default=[1, 64, 1024, 16_384])
+    parser.add_argument("--repeats", type=count, default=7)
+    options = parser.parse_args(arguments)
     models = {
         "pendulum": envs.make("pendulum").model,
         "arm": envs.make("arm").model,
@@ -186,4 +186,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    run_command(main)

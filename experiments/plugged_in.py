@@ -19,18 +19,20 @@ Prints a table, and writes what was asked for into results/plugged_in.json.
 
 from __future__ import annotations
 
-import argparse
 import json
 import math
 import statistics
 import subprocess
 import sys
 import tempfile
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import commands
-from commands import write_json
+from commands import Parser, count, write_json
+
+from jaxpg.run.errors import run_command
 
 ROOT = Path(__file__).parents[1]
 PEERS = Path(__file__).parent / "peers"
@@ -137,10 +139,10 @@ def results() -> dict[str, Row]:
     return json.loads(file.read_text(encoding="utf-8")) if file.exists() else {}
 
 
-def main(arguments: list[str]) -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+def main(arguments: Sequence[str]) -> None:
+    parser = Parser(__doc__)
     parser.add_argument("--only", nargs="+", choices=PARTS, default=list(PARTS))
-    parser.add_argument("--seeds", type=int, default=3)
+    parser.add_argument("--seeds", type=count, default=3)
     parser.add_argument("--venvs", type=Path, default=PEERS / ".venvs", help="where the virtual environments are")
     parser.add_argument("--install", action="store_true", help="print the commands that make them, and end")
     options = parser.parse_args(arguments)
@@ -157,4 +159,4 @@ def main(arguments: list[str]) -> None:
 
 
 if __name__ == "__main__":
-    main(sys.argv[1:])
+    run_command(main)

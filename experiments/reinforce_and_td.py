@@ -10,10 +10,13 @@ deterministic policy) and results/reinforce_and_td.json.
 from __future__ import annotations
 
 import tempfile
+from collections.abc import Sequence
 from pathlib import Path
 
-from commands import learning_curve, train, write_figure, write_json
+from commands import Parser, learning_curve, train, write_figure, write_json
 from matplotlib.figure import Figure
+
+from jaxpg.run.errors import run_command
 
 NUM_SEEDS = 5
 ALGORITHMS = {"td": "TD(lambda)", "reinforce": "REINFORCE, value baseline"}
@@ -23,7 +26,8 @@ TASKS = {
 }
 
 
-def main() -> None:
+def main(arguments: Sequence[str] = ()) -> None:
+    Parser(__doc__).parse_args(arguments)
     figure = Figure(figsize=(11, 4.2), layout="constrained")
     summary = {}
     with tempfile.TemporaryDirectory() as folder:
@@ -42,4 +46,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    run_command(main)

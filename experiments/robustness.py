@@ -16,13 +16,15 @@ import subprocess
 import sys
 import tempfile
 import time
+from collections.abc import Sequence
 from pathlib import Path
 from statistics import median
 from typing import Any
 
-from commands import train, write_json
+from commands import Parser, train, write_json
 from startup import measure
 
+from jaxpg.run.errors import run_command
 from jaxpg.run.folder import RunFolder, read_metrics
 
 TASKS = {"pendulum": ("env=pendulum",), "arm": ("env=arm",)}
@@ -69,7 +71,8 @@ def saving(folder: Path, arguments: tuple[str, ...]) -> dict[str, Any]:
     return {"steps": STEPS, "training, s": training, "saving, s": round(saved, 2), "share": round(saved / training, 4)}
 
 
-def main() -> None:
+def main(arguments: Sequence[str] = ()) -> None:
+    Parser(__doc__).parse_args(arguments)
     rows = []
     with tempfile.TemporaryDirectory() as folder:
         os.environ["XDG_CACHE_HOME"] = f"{folder}/cache"
@@ -81,4 +84,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    run_command(main)

@@ -11,10 +11,13 @@ Writes results/sigma_choices.png and results/sigma_choices.json.
 from __future__ import annotations
 
 import tempfile
+from collections.abc import Sequence
 from pathlib import Path
 
-from commands import learning_curve, train, write_figure, write_json
+from commands import Parser, learning_curve, train, write_figure, write_json
 from matplotlib.figure import Figure
+
+from jaxpg.run.errors import run_command
 
 TASK = "pendulum"
 NUM_SEEDS = 5
@@ -28,7 +31,8 @@ CHOICES = {
 }
 
 
-def main() -> None:
+def main(arguments: Sequence[str] = ()) -> None:
+    Parser(__doc__).parse_args(arguments)
     figure = Figure(figsize=(11, 4.2), layout="constrained")
     left, right = figure.subplots(1, 2)
     summary = {}
@@ -51,4 +55,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    run_command(main)

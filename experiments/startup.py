@@ -16,12 +16,16 @@ import sys
 import tempfile
 import time
 from collections import defaultdict
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from commands import write_json
+from commands import Parser, write_json
+
+from jaxpg.run.errors import run_command
 
 ARGUMENTS = ("env=pendulum",)
+MEASURED = "--measured"  # a process of this script that is the command, and notes where its time goes
 # Phases by what is called in them: of `jaxpg.run.session`, of its `Keeper`, or of the configuration.
 PHASES = {
     "options": ("configuration.compose",),
@@ -35,7 +39,8 @@ TRACING = ("jaxpr_trace_duration", "jaxpr_to_mlir_module_duration")
 PROGRAMS = {name for program in ("init", "advance", "play") for name in (program, f"jit({program})")}
 
 
-def main() -> None:
+def main(arguments: Sequence[str] = ()) -> None:
+    Parser(__doc__).parse_args(arguments)
     with tempfile.TemporaryDirectory() as folder:
         environment = os.environ | {"XDG_CACHE_HOME": f"{folder}/cache"}
         environment.pop("JAX_COMPILATION_CACHE_DIR", None)
@@ -52,7 +57,9 @@ def measure(environment: dict[str, str], folder: Path, *arguments: str) -> dict[
     """Phase -> [seconds, of them of the processor] of a training command, measured in its own process."""
     report = folder.with_suffix(".json")
     began, cpu_began = time.monotonic(), cpu()
-    subprocess.run([sys.executable, __file__, str(report), str(began), *arguments], env=environment, check=True)
+    subprocess.run(
+        [sys.executable, __file__, MEASURED, str(report), str(began), *arguments], env=environment, check=True
+    )
     whole = [time.monotonic() - began, cpu() - cpu_began]
     return {**json.loads(report.read_text(encoding="utf-8")), "whole process": whole}
 
@@ -160,6 +167,6 @@ def _take(phases: dict[str, list[float]], whole: str, part: str) -> None:
 
 
 if __name__ == "__main__":
-    if len(sys.argv) > 1:
-        sys.exit(measured(sys.argv[1], float(sys.argv[2]), sys.argv[3:]))
-    main()
+    if sys.argv[1:2] == [MEASURED]:
+        sys.exit(measured(sys.argv[2], float(sys.argv[3]), sys.argv[4:]))
+    run_command(main)

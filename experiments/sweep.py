@@ -12,16 +12,16 @@ else the environment reports, averaged over the seeds. Prints the best draws and
 
 from __future__ import annotations
 
-import argparse
-import sys
 import time
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
-from commands import write_json
+from commands import Parser, count, write_json
 
 from jaxpg.run.agents import crossed
 from jaxpg.run.config import Config, compose
+from jaxpg.run.errors import run_command
 from jaxpg.run.program import compile_program, make_env, plan
 from jaxpg.run.runtime import prepare
 from jaxpg.run.state import current_policy
@@ -66,10 +66,10 @@ def kept(setting: Setting, found: dict[str, np.ndarray], i: int) -> dict[str, fl
     return {name: float(f"{value:.4g}") for name, value in values.items()}
 
 
-def main(arguments: list[str]) -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--draws", type=int, default=32)
-    parser.add_argument("--seeds", type=int, default=2)
+def main(arguments: Sequence[str]) -> None:
+    parser = Parser(__doc__)
+    parser.add_argument("--draws", type=count, default=32)
+    parser.add_argument("--seeds", type=count, default=2)
     parser.add_argument("options", nargs="*", help="of python -m jaxpg.train")
     given = parser.parse_args(arguments)
     config = compose(given.options)
@@ -86,4 +86,4 @@ def main(arguments: list[str]) -> None:
 
 
 if __name__ == "__main__":
-    main(sys.argv[1:])
+    run_command(main)

@@ -24,15 +24,16 @@ Writes results/throughput.json and prints it as tables.
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import jax
 import jax.numpy as jnp
-from commands import write_json
+from commands import Parser, write_json
 
 from jaxpg.rollout import rollout
 from jaxpg.run.config import Config, compose
+from jaxpg.run.errors import run_command
 from jaxpg.run.program import compile_program, make_algorithm, make_env, plan
 from jaxpg.run.runtime import prepare
 from jaxpg.training import initial_state, train_scan
@@ -215,7 +216,8 @@ def table(rows: list[dict[str, Any]]) -> None:
         print("| " + " | ".join(value if isinstance(value, str) else f"{value:,}" for value in row.values()) + " |")
 
 
-def main() -> None:
+def main(arguments: Sequence[str] = ()) -> None:
+    Parser(__doc__).parse_args(arguments)
     prepare(configured(NUM_ENVS[0], WIDTHS[0], SHARDS))
     result = {"sizes": sizes(), "agents": agents()}
     write_json("throughput.json", result)
@@ -224,4 +226,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    run_command(main)

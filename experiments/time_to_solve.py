@@ -24,7 +24,6 @@ Prints a table (median over seeds) and writes results/time_to_solve.json and res
 
 from __future__ import annotations
 
-import argparse
 import json
 import math
 import os
@@ -33,13 +32,16 @@ import subprocess
 import sys
 import tempfile
 import time
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from commands import evaluate, train, write_figure, write_json
+from commands import Parser, count, evaluate, train, write_figure, write_json
 from matplotlib.figure import Figure
+
+from jaxpg.run.errors import run_command
 
 ROOT = Path(__file__).parents[1]
 PEERS = Path(__file__).parent / "peers"
@@ -208,9 +210,9 @@ def compete(contestants: list[Contestant], seeds: int, venvs: Path) -> dict[Cont
     return results
 
 
-def main(arguments: list[str]) -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--seeds", type=int, default=3)
+def main(arguments: Sequence[str]) -> None:
+    parser = Parser(__doc__)
+    parser.add_argument("--seeds", type=count, default=3)
     parser.add_argument("--only", nargs="+", choices=[contestant.name for contestant in CONTESTANTS])
     parser.add_argument("--venvs", type=Path, default=PEERS / ".venvs", help="where the peers' environments are")
     parser.add_argument("--install", action="store_true", help="print the commands that install the peers, and end")
@@ -231,4 +233,4 @@ def main(arguments: list[str]) -> None:
 
 
 if __name__ == "__main__":
-    main(sys.argv[1:])
+    run_command(main)

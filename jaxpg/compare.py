@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
+from envs.hints import python
 from envs.options import build
 from jaxpg.run import config
 from jaxpg.run.commands import asks_for_help
@@ -21,7 +22,7 @@ def main(arguments: Sequence[str]) -> int:
     folders = [argument for argument in arguments if "=" not in argument or Path(argument).is_dir()]
     options = build(CompareOptions, config.parse([argument for argument in arguments if argument not in folders]))
     if not folders:
-        raise UserError("run folders are missing: python -m jaxpg.compare runs/a runs/b")
+        raise UserError(f"run folders are missing: {python()} -m jaxpg.compare runs/a runs/b")
     comparison.write(folders, Path(options.out), print)
     return 0
 

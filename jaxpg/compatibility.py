@@ -8,9 +8,8 @@ import re
 # from 2097152 in up to two thirds of the calls, on more than one thread. `python tests/wrong_sums.py` reproduces it
 # where one of them is installed; with 0.10.1 and from 0.12.0 on it finds none.
 WRONG_SUMS = ("0.10.2", "0.11.0", "0.11.1", "0.11.2")
-# Releases that wait for ever when batched LAPACK calls fill XLA's thread pool; the last one is 0.11.0. With 0.10.1
-# sixty steps of 1,024 half cheetahs in MJX do not end on two cores, with 0.12.0.1 they do. The shipped environments
-# make no such calls; brax's and Playground's do.
+# Releases that can wait for ever when batched LAPACK calls fill XLA's thread pool; the last one is 0.11.0. The shipped
+# environments make no such calls; brax's and Playground's do.
 LAST_DEADLOCK = (0, 11, 0)
 
 
@@ -20,9 +19,7 @@ def check_jaxlib(version: str) -> None:
     >>> check_jaxlib("0.10.1")
     """
     if version in WRONG_SUMS:
-        raise ImportError(
-            f"jaxlib {version} computes wrong sums on a CPU; install another one: pip install 'jax!=0.10.2,!=0.11.*'"
-        )
+        raise ImportError(f"jaxlib {version} computes wrong sums on a CPU; install another one, 'jax!=0.10.2,!=0.11.*'")
 
 
 def may_deadlock(version: str) -> bool:

@@ -1,6 +1,8 @@
 """The experiments run from beginning to end, here with tiny sizes; their figures come from the full ones."""
 
+import ast
 import json
+import runpy
 import subprocess
 import sys
 from pathlib import Path
@@ -15,6 +17,67 @@ from jaxpg.run.config import compose
 EXPERIMENTS = Path(__file__).parent.parent / "experiments"
 PEERS = EXPERIMENTS / "peers"
 SCRIPTS = [script.stem for script in EXPERIMENTS.glob("*.py")]
+
+
+PROGRAMS = [path for path in EXPERIMENTS.rglob("*.py") if '__name__ == "__main__"' in path.read_text(encoding="utf-8")]
+
+
+def said(script, *arguments):
+    """Exit status, standard output and standard error of a script."""
+    command = [sys.executable, EXPERIMENTS / script, *arguments]
+    ended = subprocess.run(command, capture_output=True, text=True, check=False, timeout=60)
+    return ended.returncode, ended.stdout, ended.stderr
+
+
+def test_help_is_at_once():
+    status, output, error = said("throughput.py", "--help")
+    assert (status, error) == (0, "")
+    assert "Steps per second of TD training on the pendulum, and where they go." in output
+
+
+@pytest.fixture
+def run(monkeypatch, capfd):
+    """`run(script, *arguments)` as `said`, within this process, which has imported what is slow."""
+    monkeypatch.syspath_prepend(str(PEERS))
+
+    def run(script, *arguments):
+        monkeypatch.setattr(sys, "argv", [str(script), *arguments])
+        with pytest.raises(SystemExit) as end:
+            runpy.run_path(str(script), run_name="__main__")
+        return end.value.code, *capfd.readouterr()
+
+    return run
+
+
+@pytest.mark.parametrize("script", PROGRAMS, ids=lambda path: path.stem)
+def test_every_script_says_what_it_does_and_takes_nothing_unknown(script, run):
+    doc = ast.get_docstring(ast.parse(script.read_text(encoding="utf-8")))
+    for flag in ("--help", "-h"):
+        status, output, error = run(script, flag)
+        assert (status, error) == (0, "")
+        assert doc in output
+    for wrong in ("--nonsense", "nonsense"):
+        status, output, error = run(script, wrong)
+        assert (status, output) == (2, "")
+        assert error.startswith("error: ")
+        assert "nonsense" in error
+        assert len(error.splitlines()) == 1
+
+
+MISTAKES = {
+    "default_runs.py pendulm": "unknown task 'pendulm': did you mean 'pendulum'?; default_runs.py --help says more",
+    "sweep.py --draws 0 env=arm": "argument --draws: 0: expected a whole number, at least 1; sweep.py --help says more",
+    "sweep.py env=arm algo.gama=1": "unknown option 'algo.gama': did you mean 'algo.gamma'?",
+    "endurance.py num_envz=3": "unknown option 'num_envz': did you mean 'num_envs'?",
+    "peers/sb3.py algo=ppo": "out=... is missing; --help says more",
+    "peers/sb3.py alg=ppo out=x": "unknown argument 'alg'; --help says more",
+}
+
+
+@pytest.mark.parametrize("line", MISTAKES)
+def test_mistakes_are_one_line(line, run):
+    script, *arguments = line.split()
+    assert run(EXPERIMENTS / script, *arguments) == (2, "", f"error: {MISTAKES[line]}\n")
 
 
 @pytest.fixture
@@ -106,8 +169,7 @@ def test_endurance(experiments, monkeypatch):
     import endurance
 
     monkeypatch.setattr(endurance, "TASK", "quadratic")
-    monkeypatch.setattr(sys, "argv", ["endurance.py", "--seconds", "2"])
-    endurance.main()
+    endurance.main(["--seconds", "2"])
     result = json.loads((experiments / "endurance.json").read_text())
     assert min(result["resident, MB"]) > 100
     assert result["steps"] > 0

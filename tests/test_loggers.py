@@ -259,7 +259,7 @@ def test_one_line_where_a_package_is_missing(tmp_path, monkeypatch):
     monkeypatch.setattr(sys, "path", [str(tmp_path), *(p for p in sys.path if not Path(p, "wandb").exists())])
     monkeypatch.delitem(sys.modules, "wandb", raising=False)
     (tmp_path / "wandb").mkdir()
-    with pytest.raises(UserError, match=r"^loggers=\[wandb\]: pip install wandb$"):
+    with pytest.raises(UserError, match=r"^loggers=\[wandb\]: \S+ -m pip install wandb$"):
         train.main(["env=quadratic", "loggers=[wandb]", f"run_dir={tmp_path / 'run'}"])
     assert not (tmp_path / "run").exists()
 
@@ -272,7 +272,7 @@ def test_a_store_on_this_machine_needs_a_database(monkeypatch, uri):
     if uri:
         follower.check(["mlflow"])
     else:
-        with pytest.raises(UserError, match=r"^loggers=\[mlflow\]: pip install mlflow$"):
+        with pytest.raises(UserError, match=r"^loggers=\[mlflow\]: \S+ -m pip install mlflow$"):
             follower.check(["mlflow"])
 
 

@@ -12,6 +12,7 @@ import pytest
 from flax import struct
 
 import envs
+from envs.hints import pip_install
 from envs.options import OptionError
 from envs.playground_env import Playground
 from jaxpg.evaluation import evaluate
@@ -155,7 +156,7 @@ def test_what_cannot_be_made_is_one_line(playground, error, words):
 
 def test_a_missing_package_is_one_line(monkeypatch):
     monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
-    assert complaint() == "env=playground needs MuJoCo Playground: pip install playground"
+    assert complaint() == f"env=playground needs MuJoCo Playground: {pip_install('playground')}"
 
 
 def test_the_real_one_balances_for_a_moment():

@@ -385,7 +385,7 @@ def test_without_opengl_there_is_one_line_and_no_file(run, command_environment):
 
 def test_without_the_package_for_mp4_there_is_one_line(run, monkeypatch):
     monkeypatch.setitem(sys.modules, "av", None)
-    with pytest.raises(UserError, match=r"video.mp4: .mp4 needs a package, pip install av; .* needs none$"):
+    with pytest.raises(UserError, match=r"video.mp4: .mp4 needs a package, \S+ -m pip install av; .* needs none$"):
         command_line.main([f"run={run}"])
 
 

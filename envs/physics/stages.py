@@ -135,8 +135,8 @@ def as_kernel(function: Callable) -> Callable:
     """A function that XLA's CPU compiler makes one kernel of, instead of one for every loop in it.
 
     XLA does so with the small loops it finds itself, by marking their call; the mark is set here by hand. The compiler
-    aborts at a marked call with a parameter that nothing uses, and its simplifications remove uses: hence a call inside
-    the call, whose operands stay, and the barrier, which constants do not pass.
+    relies on it that a marked call uses whatever it is given, also after simplifications, and ends the process where
+    that is not so: hence a call inside the call, whose operands stay, and the barrier, which constants do not pass.
     """
     call = separately(separately(function), xla_cpu_small_call="true")
 

@@ -7,16 +7,20 @@ list of {"steps", "return", "stderr"} of deterministic episodes, as brax's own e
 
 from __future__ import annotations
 
-import functools
-import json
-import math
-import sys
-from pathlib import Path
-from typing import Any
+from protocol import parse
 
-from brax import envs
-from brax.training.agents.ppo import networks
-from brax.training.agents.ppo import train as ppo
+NAMES = ("env", "steps", "seed", "out")
+OPTIONS = parse(NAMES, needed=NAMES)  # before the imports, which take a while
+
+import functools  # noqa: E402
+import json  # noqa: E402
+import math  # noqa: E402
+from pathlib import Path  # noqa: E402
+from typing import Any  # noqa: E402
+
+from brax import envs  # noqa: E402
+from brax.training.agents.ppo import networks  # noqa: E402
+from brax.training.agents.ppo import train as ppo  # noqa: E402
 
 EPISODES = 128
 COMMON = {
@@ -60,8 +64,7 @@ def make(name: str) -> tuple[Any, Any]:
     return registry.load(name, config_overrides={"impl": "jax"}), wrapper.wrap_for_brax_training
 
 
-def main(arguments: list[str]) -> None:
-    options = dict(argument.split("=", 1) for argument in arguments)
+def main(options: dict[str, str]) -> None:
     curve = []
 
     def note(steps: int, metrics: dict[str, Any]) -> None:
@@ -85,4 +88,4 @@ def main(arguments: list[str]) -> None:
 
 
 if __name__ == "__main__":
-    main(sys.argv[1:])
+    main(OPTIONS)

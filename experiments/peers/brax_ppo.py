@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from protocol import TORQUE_LIMIT, begin
 
-OPTIONS, RECORDER = begin()  # before the imports, which are part of what is timed
+OPTIONS, RECORDER = begin(["physics"])  # before the imports, which are part of what is timed
 
 import contextlib  # noqa: E402
 import functools  # noqa: E402

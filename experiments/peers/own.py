@@ -6,7 +6,7 @@ updates, and so the policies, are those of the command, bit for bit. Options but
 
 from __future__ import annotations
 
-from protocol import TORQUE_LIMIT, begin
+from protocol import RECORDERS, TORQUE_LIMIT, begin
 
 OPTIONS, RECORDER = begin()  # before the imports, which are part of what is timed
 
@@ -22,8 +22,6 @@ from jaxpg.run.config import compose  # noqa: E402
 from jaxpg.run.program import compile_program, make_env, make_networks, plan  # noqa: E402
 from jaxpg.run.runtime import prepare  # noqa: E402
 from jaxpg.run.state import current_policy  # noqa: E402
-
-RECORDERS = ("out", "budget", "started")
 
 
 def main() -> None:

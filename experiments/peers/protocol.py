@@ -14,7 +14,7 @@ from __future__ import annotations
 import json
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from pathlib import Path
 from typing import Any
 
@@ -23,6 +23,7 @@ import numpy as np
 NUM_STARTS = 200
 EPISODE_LENGTH = 200
 SPEED_LIMIT, TORQUE_LIMIT, DT = 8.0, 2.0, 0.05
+RECORDERS = ("out", "budget", "started")  # options
 INTERVAL = 0.5, 0.02  # between two evaluations, at least: seconds of training, and part of all seconds so far
 
 Act = Callable[[np.ndarray], Any]  # observations [N, 3] in float32 -> torques [N] or [N, 1], in N m
@@ -112,8 +113,34 @@ class Recorder:
         self._out.write_text(json.dumps(lines, indent=1) + "\n", encoding="utf-8")
 
 
-def begin(arguments: list[str] | None = None) -> tuple[dict[str, str], Recorder]:
-    """The options of the command line, and a recorder made of them."""
-    options = dict(argument.split("=", 1) for argument in (sys.argv[1:] if arguments is None else arguments))
+def parse(known: Collection[str] | None, needed: Collection[str]) -> dict[str, str]:
+    """The options of the command line by name, before anything slow is imported.
+
+    `--help` prints what the script says of itself and ends; an argument of another form, a name that is not known
+    (None: all are) and one that is needed and missing end in one line and status 2.
+    """
+    doc, arguments = sys.modules["__main__"].__doc__ or "", sys.argv[1:]
+    if {"--help", "-h"} & set(arguments):
+        print(doc.strip())
+        sys.exit(0)
+    options = dict(argument.split("=", 1) for argument in arguments if "=" in argument)
+    wrong = [argument for argument in arguments if "=" not in argument]
+    wrong += [name for name in options if known is not None and name not in known]
+    missing = [f"{name}=..." for name in needed if name not in options]
+    if wrong or missing:
+        reason = f"unknown argument '{wrong[0]}'" if wrong else f"{missing[0]} is missing"
+        print(f"error: {reason}; --help says more", file=sys.stderr)
+        sys.exit(2)
+    return options
+
+
+def begin(names: Collection[str] | None = None, needed: Collection[str] = ()) -> tuple[dict[str, str], Recorder]:
+    """The options of the command line, and a recorder made of them.
+
+    Args:
+      names: of the script's own options beside the recorder's and `seed`; None: any may be given.
+      needed: of these, such as have no default.
+    """
+    options = parse(None if names is None else (*RECORDERS, "seed", *names), ("out", *needed))
     started = float(options.get("started", time.time()))
     return options, Recorder(options["out"], float(options.get("budget", "inf")), started)

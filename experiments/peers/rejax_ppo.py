@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from protocol import begin
 
-OPTIONS, RECORDER = begin()  # before the imports, which are part of what is timed
+OPTIONS, RECORDER = begin([])  # before the imports, which are part of what is timed
 
 import jax  # noqa: E402
 import jax.numpy as jnp  # noqa: E402

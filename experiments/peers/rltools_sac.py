@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from protocol import TORQUE_LIMIT, begin
 
-OPTIONS, RECORDER = begin()  # before the imports, which are part of what is timed
+OPTIONS, RECORDER = begin([])  # before the imports, which are part of what is timed
 
 import gymnasium  # noqa: E402
 import numpy as np  # noqa: E402

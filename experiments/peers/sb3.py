@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from protocol import Recorder, begin
 
-OPTIONS, RECORDER = begin()  # before the imports, which are part of what is timed
+OPTIONS, RECORDER = begin(["algo"])  # before the imports, which are part of what is timed
 
 import torch  # noqa: E402
 from stable_baselines3 import A2C, PPO  # noqa: E402

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from protocol import Recorder, begin
 
-OPTIONS, RECORDER = begin()
+OPTIONS, RECORDER = begin(["env", "steps"], needed=["env", "steps"])
 
 import sys  # noqa: E402
 from pathlib import Path  # noqa: E402

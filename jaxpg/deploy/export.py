@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import importlib
-import sys
 import tempfile
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -13,6 +12,7 @@ from typing import NamedTuple
 import jax
 import numpy as np
 
+from envs.hints import pip_install
 from jaxpg.deploy import c, files, learning, onnx, reference, stablehlo
 from jaxpg.deploy.controller import NUM_OBSERVATIONS, Controller, commanding, controller, drawn, played
 from jaxpg.run import folder, policies
@@ -49,7 +49,7 @@ def _check_packages(form: str, *names: str) -> None:
         try:
             importlib.import_module(name)
         except ImportError:
-            install = f"{sys.executable} -m pip install {' '.join(names)}"
+            install = pip_install(*names)
             raise UserError(f"format={form} needs {name}, which cannot be loaded: {install}") from None
 
 

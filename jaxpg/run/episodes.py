@@ -9,6 +9,7 @@ import jax
 import numpy as np
 
 import envs
+from envs.hints import pip_install
 from jaxpg.evaluation import evaluate
 from jaxpg.run.errors import UserError
 from jaxpg.run.policies import StoredPolicy
@@ -53,7 +54,7 @@ def play_gymnasium(stored: StoredPolicy, num_episodes: int, seed: int) -> Result
     try:
         import gymnasium
     except ImportError:
-        raise UserError("backend=gymnasium needs Gymnasium: pip install gymnasium") from None
+        raise UserError(f"backend=gymnasium needs Gymnasium: {pip_install('gymnasium')}") from None
     pendulums = gymnasium.make_vec("Pendulum-v1", num_envs=num_episodes, vectorization_mode="sync")
     limit = pendulums.single_action_space.high
     act = jax.jit(stored.act)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import importlib
 import io
+import shlex
 import time
 from collections.abc import Callable, Mapping
 from signal import Signals
@@ -13,6 +14,7 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
+from envs.hints import python
 from jaxpg.run import agents, figures, folder, lock, memory, results, same_run, versions
 from jaxpg.run import config as configuration
 from jaxpg.run.cache import compilation_cache, physics_cache
@@ -333,5 +335,5 @@ def _closing_rows(
         "speed": f"{rate:,.0f} steps/s",
         "time": f"{compile_seconds:.1f} s compiling, {training_seconds:.1f} s training",
         "run folder": str(run_folder.path),
-        "evaluate it": f"python -m jaxpg.evaluate run={run_folder.path}",
+        "evaluate it": f"{python()} -m jaxpg.evaluate run={shlex.quote(str(run_folder.path))}",
     }

@@ -18,6 +18,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from envs.hints import pip_install
 from jaxpg.run.errors import UserError
 from jaxpg.run.folder import UNFINISHED
 
@@ -52,7 +53,8 @@ def chosen(out: Path) -> Format:
     if out.is_dir():
         raise UserError(f"out={out}: there is a folder of that name")
     if form.package and importlib.util.find_spec(form.package) is None:
-        raise UserError(f"out={out}: {out.suffix} needs a package, pip install {form.package}; out=FILE.gif needs none")
+        remedy = f"{pip_install(form.package)}; out=FILE.gif needs none"
+        raise UserError(f"out={out}: {out.suffix} needs a package, {remedy}")
     return form
 
 

@@ -13,6 +13,7 @@ from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import BinaryIO
 
+from envs.hints import pip_install
 from jaxpg.run import files
 from jaxpg.run.errors import UserError
 from jaxpg.run.loggers import SERVICES, LoggerError
@@ -88,7 +89,7 @@ def check(names: Iterable[str]) -> None:
     """Raises UserError, with what to install, where one of the services' packages is missing."""
     for name in names:
         if not all(map(_is_installed, importlib.import_module(SERVICES[name]).packages())):
-            raise UserError(f"loggers=[{name}]: pip install {name}")
+            raise UserError(f"loggers=[{name}]: {pip_install(name)}")
 
 
 def _is_installed(package: str) -> bool:
