@@ -1,15 +1,33 @@
-"""C MuJoCo's own step, called back from the compiled program: the reference, environment after environment."""
+"""C MuJoCo's own step, called from the compiled program: the reference, on all cores.
+
+`mujoco.batch` steps all environments of a call in its threads, with the same bits at any number of them. On a CPU the
+call reads and writes XLA's own buffers: `jax.pure_callback` copies large arguments by threads that may all be waiting
+for the callback already, as with one device for each of two shards, and then no step ever ends.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import copy
+import functools
+import os
+import threading
+from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING
 
 import jax
 import numpy as np
+from jax.experimental.buffer_callback import buffer_callback
+
+from envs.physics.fields import MODEL, types_of
 
 if TYPE_CHECKING:
     import mujoco
+    import mujoco.batch
+
+KEPT = 4  # sizes of batches that keep their memory and threads
+# MuJoCo prints a warning, and writes it into a file in the working directory, when it counts the first of its kind.
+COUNTED = 1
+DIVERGED = ("mjWARN_BADQPOS", "mjWARN_BADQVEL", "mjWARN_BADQACC", "mjWARN_BADCTRL")
 
 
 def callback_step(
@@ -17,36 +35,105 @@ def callback_step(
 ) -> Callable[..., tuple[jax.Array, ...]]:
     """`num_substeps` times `mj_step`, in double precision, as a function like those of `compile_step`.
 
+    All real numbers that it returns of an environment are NaN if one of its inputs is, or if in one of the substeps a
+    position, velocity or acceleration is NaN or beyond 1e10 (`mjMAXVAL`), where MuJoCo by itself would restart the
+    environment, or a control is so, where MuJoCo sets all controls to 0. Other environments of the batch go on.
+
     Args:
-      model, num_substeps, inputs, outputs: as there; the model is the same in all environments.
+      model, num_substeps, inputs, outputs: as there.
 
     Raises:
-      ValueError: the model is among the inputs.
+      ValueError: among the inputs is a field of the model that `mujoco.batch` has once for all environments.
     """
-    import mujoco
+    simulations = Simulations(model, num_substeps, inputs, outputs)
 
-    fields = [name for name in inputs if name.startswith("model.")]
-    if fields:
-        raise ValueError(f"{fields[0]}: with physics 'mujoco' all environments have the model as it is")
-    data = mujoco.MjData(model)
-    shapes = [jax.ShapeDtypeStruct(np.shape(getattr(data, name)), np.float32) for name in outputs]
+    def by_buffers(_, results, *arrays):
+        simulations.step(list(map(np.asarray, arrays)), list(map(np.asarray, results)))
 
-    def rows(*arrays: jax.Array) -> list[np.ndarray]:
-        """Of all environments: leading axes are theirs."""
-        arrays = [np.asarray(array, np.float64) for array in arrays]
-        leading = np.shape(arrays[0])[: arrays[0].ndim - np.ndim(getattr(data, inputs[0]))]
-        results = [np.empty((*leading, *shape.shape), np.float32) for shape in shapes]
-        for place in np.ndindex(*leading):
-            mujoco.mj_resetData(model, data)
-            for name, array in zip(inputs, arrays, strict=True):
-                getattr(data, name)[...] = array[place]
-            for _ in range(num_substeps):
-                mujoco.mj_step(model, data)
-            for name, result in zip(outputs, results, strict=True):
-                result[place] = getattr(data, name)
+    def by_copies(*arrays):
+        arrays = list(map(np.asarray, arrays))
+        results = [np.empty((*simulations.leading(arrays), *x.shape), x.dtype) for x in types_of(model, outputs)]
+        simulations.step(arrays, results)
         return results
 
     def step(*arrays):
-        return tuple(jax.pure_callback(rows, shapes, *arrays, vmap_method="broadcast_all"))
+        types, method = types_of(model, outputs), {"vmap_method": "broadcast_all"}
+        here = buffer_callback(by_buffers, types, **method)
+        elsewhere = functools.partial(jax.pure_callback, by_copies, types, **method)
+        return tuple(jax.lax.platform_dependent(*arrays, cpu=here, default=elsewhere))
 
     return step
+
+
+class Simulations:
+    """Simulations of a model by `mujoco.batch`; one call of `step` is one control step of all that it is given.
+
+    Nothing is left of a call for the next one. Calls from several threads wait for one another: each has all cores.
+    """
+
+    def __init__(self, model: mujoco.MjModel, num_substeps: int, inputs: Sequence[str], outputs: Sequence[str]):
+        import mujoco
+        import mujoco.batch
+
+        for name in inputs:
+            if name.startswith(MODEL) and name.removeprefix(MODEL) not in mujoco.batch.MODEL_FIELDS:
+                raise ValueError(f"{name}: with physics 'mujoco' it cannot differ between environments")
+        self._model = copy.copy(model)
+        self._model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET
+        self._num_substeps, self._inputs, self._outputs = num_substeps, inputs, outputs
+        self._rank = len(types_of(model, inputs[:1])[0].shape)
+        self._initial = _initial_state(self._model)
+        self._diverged = [int(getattr(mujoco.mjtWarning, name)) for name in DIVERGED]
+        self._batch = functools.lru_cache(maxsize=KEPT)(self._new_batch)
+        self._lock = threading.Lock()
+
+    def leading(self, arrays: Sequence[np.ndarray]) -> tuple[int, ...]:
+        """The leading axes of the inputs: those of the environments."""
+        return arrays[0].shape[: arrays[0].ndim - self._rank]
+
+    def step(self, arrays: Sequence[np.ndarray], results: Sequence[np.ndarray]) -> None:
+        """Fills the results with the outputs of all environments, from the inputs of all."""
+        number = int(np.prod(self.leading(arrays), dtype=int))
+        if number:
+            with self._lock, np.errstate(over="ignore"):  # what is too large for float32 becomes inf
+                self._step(self._batch(number), [x.reshape(number, -1) for x in arrays], results)
+
+    def _step(self, batch: mujoco.batch.Batch, rows: list[np.ndarray], results: Sequence[np.ndarray]) -> None:
+        batch.state[...] = self._initial
+        batch.warning[...] = COUNTED
+        for name, values in zip(self._inputs, rows, strict=True):
+            _field(batch, name)[...] = values
+        sound = ~np.any([np.isnan(values).any(1) for values in rows], 0)
+        batch.step(sound, self._num_substeps)
+        sound &= (batch.warning[:, self._diverged, 1] == COUNTED).all(1)
+        for name, result in zip(self._outputs, results, strict=True):
+            result = result.reshape(len(sound), -1)
+            result[...] = _field(batch, name)
+            result[~sound] = np.nan if result.dtype.kind == "f" else 0
+
+    def _new_batch(self, number: int) -> mujoco.batch.Batch:
+        import mujoco.batch
+
+        return mujoco.batch.Batch(self._model, number, min(number, _num_cores()))
+
+
+def _field(batch: mujoco.batch.Batch, name: str) -> np.ndarray:
+    """The numbers of a field of all simulations, `[N, size]`; what is written into them is what the next step gets."""
+    is_model = name.startswith(MODEL)
+    values = batch.expand(name.removeprefix(MODEL)) if is_model else batch.bind(name)
+    return values.reshape(batch.nsim, -1)
+
+
+def _initial_state(model: mujoco.MjModel) -> np.ndarray:
+    """What MuJoCo integrates, with the inputs of a step among it, as `mjx.make_data` has it."""
+    import mujoco
+
+    kind = mujoco.mjtState.mjSTATE_INTEGRATION
+    state = np.empty(mujoco.mj_stateSize(model, kind))
+    mujoco.mj_getState(model, mujoco.MjData(model), state, kind)
+    return state
+
+
+def _num_cores() -> int:
+    """Those that this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1

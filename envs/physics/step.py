@@ -16,6 +16,7 @@ import jax
 import jax.numpy as jnp
 
 from envs.physics.callback import callback_step
+from envs.physics.fields import MODEL, STATE, as_arguments, check_names, types_of, unknown
 from envs.physics.interpreter import Program, trace
 from envs.physics.models import import_mjx, model_name, put_model
 from envs.physics.rules import UnsupportedPrimitive
@@ -31,8 +32,6 @@ logger = logging.getLogger(__name__)
 StepFn = Callable[..., tuple[jax.Array, ...]]
 
 PHYSICS = ("scalar", "mjx", "mujoco")
-STATE = ("qpos", "qvel", "act", "qacc_warmstart", "time")  # what a step hands on to the next one
-MODEL = "model."
 
 
 def compile_step(
@@ -68,8 +67,7 @@ def compile_step(
     """
     if physics not in PHYSICS:
         raise ValueError(f"physics is {physics!r}; it must be one of {', '.join(PHYSICS)}")
-    if model.na and "act" not in inputs:
-        raise ValueError(f"the model has {model.na} actuator activation states, which the inputs {inputs} do not carry")
+    check_names(model, inputs, outputs)
     carried = tuple(name for name in inputs if name in STATE)
     results = carried + tuple(name for name in outputs if name not in carried)
     if physics == "scalar":
@@ -88,9 +86,8 @@ def compile_step(
             return _repeat(lambda values: once(*values), inputs, carried, num_substeps, arrays)
 
     def step(*arrays):
-        if len(arrays) != len(inputs):
-            raise TypeError(f"the step is a function of {', '.join(inputs)}; got {len(arrays)} arguments")
-        values = dict(zip(results, repeated(*map(jnp.asarray, arrays)), strict=True))
+        arguments = as_arguments(inputs, types_of(model, inputs), arrays)
+        values = dict(zip(results, repeated(*arguments), strict=True))
         return tuple(values[name] for name in outputs)
 
     return step
@@ -113,6 +110,7 @@ def single_step(model: mujoco.MjModel, inputs: tuple[str, ...], outputs: tuple[s
     """`mjx.step` as a function from the named inputs to the named outputs, with example arguments."""
     mjx = import_mjx()
     mjx_model = put_model(model)
+    _check_model_fields(mjx_model, inputs)
     initial = mjx.make_data(mjx_model)
 
     def step(*arrays):
@@ -123,6 +121,15 @@ def single_step(model: mujoco.MjModel, inputs: tuple[str, ...], outputs: tuple[s
         return tuple(getattr(data, name) for name in outputs)
 
     return step, [_field(mjx_model if name.startswith(MODEL) else initial, name) for name in inputs]
+
+
+def _check_model_fields(mjx_model, inputs: tuple[str, ...]) -> None:
+    """Raises ValueError, with the nearest name, for a field of the model that is a constant to MJX."""
+    paths = [path for path, _ in jax.tree_util.tree_leaves_with_path(mjx_model)]
+    known = [MODEL + jax.tree_util.keystr(path, simple=True, separator=".") for path in paths]
+    for name in inputs:
+        if name.startswith(MODEL) and name not in known:
+            raise ValueError(f"MJX does not compute with a changed {name}; {unknown('input', name, known)}")
 
 
 def _field(owner, name: str) -> jax.Array:
