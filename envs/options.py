@@ -119,7 +119,8 @@ def _field_problems(field: dataclasses.Field, hint: Any) -> Iterator[str]:
     if not field.init:
         yield f"{where} has init=False: what follows from the options belongs to the environment"
     elif not _is_supported(hint):
-        yield f"{where} is {_shown(hint)}: expected int, float, bool, str, Literal, a list or tuple of these, or ... | None"
+        expected = "int, float, bool, str, Literal, a list or tuple of these, or ... | None"
+        yield f"{where} is {_shown(hint)}: expected {expected}"
     elif field.default is dataclasses.MISSING and field.default_factory is dataclasses.MISSING:
         yield f"{where} has no default"
     elif not field.name.isascii():

@@ -14,6 +14,11 @@ from jaxpg.run.errors import run_command
 MISTAKES = {
     "unknown option": (["lerning_rate=3"], "unknown option 'lerning_rate'"),
     "misspelt option": (["algo.gama=0.9"], "unknown option 'algo.gama': did you mean 'algo.gamma'?"),
+    "part of a name": (["algo.lr=0.1"], "unknown option 'algo.lr': did you mean 'algo.actor_lr'?"),
+    "part of a name without its group": (["lr=0.1"], "unknown option 'lr': did you mean 'algo.actor_lr'?"),
+    "name with nothing near": (["algo.learning_rate=0.1"], "known are algo.actor_lr, algo.clip,"),
+    "table for a number": (["env.mass={a: 1}"], "env.mass={'a': 1}: expected a number"),
+    "interpolation for a number": (["env.mass='${seed}'"], "env.mass=${seed}: expected a number"),
     "option without its group": (["gamma=0.9"], "unknown option 'gamma': did you mean 'algo.gamma'?"),
     "misspelt environment": (["env=pendulm"], "unknown env 'pendulm': did you mean 'pendulum'?"),
     "misspelt algorithm": (["algo=reinforc"], "unknown algo 'reinforc': did you mean 'reinforce'?"),
@@ -93,8 +98,12 @@ MISTAKES = {
     ),
     "environments beyond 32 bits": (["num_envs=1000000000000"], "must be at least 1, at most 2147483647"),
     "updates beyond 32 bits": (
-        ["num_envs=1", "num_steps=1", "total_steps=1e12"],
+        ["algo=td", "num_envs=1", "num_steps=1", "total_steps=1e12"],
         "total_steps=1000000000000: with 1 steps an update it must stay below 2147483647",
+    ),
+    "gradient steps beyond 32 bits": (
+        ["algo=ppo", "num_envs=512", "num_steps=30", "algo.epochs=10", "algo.minibatches=8", "total_steps=5e11"],
+        "total_steps=500000000000: with 15360 steps and 80 gradient steps an update it must stay below 412316851200",
     ),
     "episodes beyond 32 bits": (["env.episode_length=3e9"], "env.episode_length=3000000000: it must stay below 2**31"),
     "rollouts beyond memory": (["num_envs=50000000"], "num_envs=50000000: such a training needs "),
@@ -209,6 +218,10 @@ RUN_MISTAKES = {
     ),
     "misspelt on resume": (train, ["resume={run}", "totl_steps=9"], "did you mean 'total_steps'?"),
     "no run": (evaluate, [], "run=DIR is missing"),
+    "run without its name": (evaluate, ["{run}"], "expected run={run}"),
+    "run to resume without its name": (train, ["{run}"], "expected resume={run}"),
+    "run with too long a name": (evaluate, ["run={run}" + 300 * "x"], "is not a "),
+    "run with too long a name to resume": (train, ["resume={run}" + 300 * "x"], "is not a "),
     "folder that is no run": (evaluate, ["run={run}/tb"], "is not a run folder"),
     "misspelt backend": (evaluate, ["run={run}", "backend=gym"], "must be mjx or mujoco or gymnasium"),
     "misspelt evaluation option": (evaluate, ["run={run}", "episode=3"], "did you mean 'episodes'?"),
@@ -228,7 +241,7 @@ def test_mistakes_about_a_run(mistake, finished, monkeypatch, capsys):
     before = tree(finished)
     status, error = run(module.main, [argument.format(run=finished) for argument in arguments], monkeypatch, capsys)
     assert status == 2
-    assert message in error
+    assert message.format(run=finished) in error
     assert len(error.splitlines()) == 1
     assert tree(finished) == before
 

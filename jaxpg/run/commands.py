@@ -53,7 +53,7 @@ def about_a_run_in(command: str, schema: type, arguments: Sequence[str]) -> tupl
 
 
 def check_named(option: str, arguments: Sequence[str]) -> None:
-    """Raises UserError where a run's folder is given without the name of its option, as `python -m jaxpg.compare` has it."""
+    """Raises UserError where a run's folder is given without its option's name, as only the comparison takes them."""
     for argument in arguments:
         if "=" not in argument and not argument.startswith("-") and ("/" in argument or Path(argument).is_dir()):
             raise UserError(f"'{argument}': expected {option}={argument}")

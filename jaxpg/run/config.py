@@ -155,8 +155,10 @@ def _conflicts_of_agents(config: Config) -> Iterator[str]:
 
 def _conflicts_of_sizes(run: Run, algo: Any, horizon: int) -> Iterator[str]:
     """XLA's indices and the counters of steps and updates are 32-bit numbers."""
-    if not 1 <= horizon < 2**31:
-        yield f"env.episode_length={horizon}: it must be at least 1 and stay below 2**31"
+    if horizon < 1:
+        yield f"env.episode_length={horizon}: it must be at least 1"
+    if horizon >= 2**31:
+        yield f"env.episode_length={horizon}: it must stay below 2**31"
     rollout = run.num_envs * run.num_steps
     if rollout >= 2**31:
         yield f"num_envs={run.num_envs} num_steps={run.num_steps}: their product must stay below 2**31"

@@ -4,23 +4,24 @@ from __future__ import annotations
 
 import dataclasses
 import os
+import shlex
 import sys
 from collections.abc import Iterator, Mapping
 from typing import Any
 
 import envs
+from envs.hints import python
 from envs.options import OptionError, build, unknown
 from jaxpg.run.schema import GROUPS, Run
 
 PROGRAM = "program"  # in config.yaml: what registered the environment
-INSTEAD = "instead of python -m jaxpg.COMMAND say python {program} COMMAND"
 
 
 def training_values(name: str) -> Mapping[str, Mapping[str, Any]]:
     """The training values of the environment `name`, by algorithm.
 
-    All of them are checked, so that a mistake does not wait for its algorithm. A value may be an option of any algorithm
-    or network, since several often share theirs; one that the chosen ones do not have counts for nothing.
+    All of them are checked, so that a mistake does not wait for its algorithm. A value may be an option of any
+    algorithm or network, since several often share theirs; one that the chosen ones do not have counts for nothing.
 
     Raises:
       OptionError: a line for each that is no option (with the nearest name), or of a wrong type or out of range.
@@ -34,14 +35,14 @@ def training_values(name: str) -> Mapping[str, Mapping[str, Any]]:
 
 def _problems(name: str, training: Any) -> Iterator[str]:
     if not isinstance(training, Mapping):
-        yield f"{training!r}: expected them by algorithm, such as {{'td': {{'num_envs': 64}}}}"
+        yield f"expected values by algorithm, such as {{'td': {{'num_envs': 64}}}}, not {training!r}"
         return
     schemas = _schemas(name)
     for algo, values in training.items():
         if algo not in GROUPS["algo"]:
             yield unknown("algo", str(algo), GROUPS["algo"])
         elif not isinstance(values, Mapping):
-            yield f"{algo}: {values!r}: expected values by option, such as {{'num_envs': 64}}"
+            yield f"{algo}: expected values by option, such as {{'num_envs': 64}}, not {values!r}"
         else:
             for option, value in values.items():
                 yield from (f"{algo}: {problem}" for problem in _problems_of_value(algo, option, value, schemas))
@@ -82,12 +83,22 @@ def program_of(env: str) -> dict[str, str]:
     return {PROGRAM: f"-m {module.name}" if module else os.path.abspath(path)}
 
 
+def command(env: str, verb: str) -> str:
+    """How a command about a run of this environment begins, such as `python -m jaxpg.evaluate`."""
+    program = program_of(env)
+    return _command(program[PROGRAM], verb) if program else f"{python()} -m jaxpg.{verb}"
+
+
+def _command(program: str, verb: str) -> str:
+    return f"{python()} {program if program.startswith('-m ') else shlex.quote(program)} {verb}"
+
+
 def check_known(env: str, program: str | None) -> None:
-    """Raises OptionError where no environment of the name is registered, with what does register it, if that is known."""
+    """Raises OptionError where no environment has the name, with the program that registers it, if that is known."""
     if env in envs.REGISTRY:
         return
-    if program is None:
-        known = unknown("env", env, envs.REGISTRY)
-        advice = f"one of your own is known to its script: {INSTEAD.format(program='SCRIPT')}"
-        raise OptionError([f"{known.removesuffix('?')}; {advice}"])
-    raise OptionError([f"unknown env '{env}': {program} registers it; {INSTEAD.format(program=program)}"])
+    problem = unknown("env", env, envs.REGISTRY).removesuffix("?")
+    if program is not None:
+        problem = f"unknown env '{env}': {program} registers it"
+    instead = f"instead of {python()} -m jaxpg.COMMAND say {_command(program or 'SCRIPT', 'COMMAND')}"
+    raise OptionError([f"{problem}; {instead}" + ("" if program else ", with the script that registers it")])

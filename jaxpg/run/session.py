@@ -14,8 +14,7 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
-from envs.hints import python
-from jaxpg.run import agents, figures, folder, lock, memory, results, same_run, versions
+from jaxpg.run import agents, figures, folder, lock, memory, registered, results, same_run, versions
 from jaxpg.run import config as configuration
 from jaxpg.run.cache import compilation_cache, physics_cache
 from jaxpg.run.chunks import PATIENCE, Watch, summary
@@ -256,7 +255,8 @@ def _show_results(session: Session, rate: float, compile_seconds: float, trainin
     if config.sweep:
         display.say(results.heading(config))
         display.table(results.table(config, lines))
-    display.table(_closing_rows(lines, session.run_folder, rate, compile_seconds, training_seconds))
+    env = config.choices["env"]
+    display.table(_closing_rows(lines, env, session.run_folder, rate, compile_seconds, training_seconds))
     if config.run.report:
         _write_report(session)
 
@@ -317,7 +317,12 @@ def is_solved(run: Run, best_returns: np.ndarray) -> bool:
 
 
 def _closing_rows(
-    lines: list[dict[str, Any]], run_folder: RunFolder, rate: float, compile_seconds: float, training_seconds: float
+    lines: list[dict[str, Any]],
+    env: str,
+    run_folder: RunFolder,
+    rate: float,
+    compile_seconds: float,
+    training_seconds: float,
 ) -> dict[str, str]:
     evaluations = [line for line in lines if "eval_return" in line]
     last = evaluations[-1]
@@ -335,5 +340,5 @@ def _closing_rows(
         "speed": f"{rate:,.0f} steps/s",
         "time": f"{compile_seconds:.1f} s compiling, {training_seconds:.1f} s training",
         "run folder": str(run_folder.path),
-        "evaluate it": f"{python()} -m jaxpg.evaluate run={shlex.quote(str(run_folder.path))}",
+        "evaluate it": f"{registered.command(env, 'evaluate')} run={shlex.quote(str(run_folder.path))}",
     }
