@@ -90,7 +90,7 @@ class Checkpoints:
         _silence_what_is_left_behind()
         descriptor = files.open_folder(self.folder, make=not self._read_only)
         self._close = weakref.finalize(self, os.close, descriptor)
-        self._descriptor, self._place = descriptor, files.through(descriptor)
+        self._descriptor, self._place = descriptor, files.through(descriptor, self.folder)
         if not self._read_only:
             _check_no_links(descriptor)
         self._manager = ocp.CheckpointManager(self._place, item_names=("state", "meta"), options=self._options)
@@ -168,7 +168,9 @@ class Checkpoints:
         A run folder that is gone is not made again.
         """
         with files.opened(self.folder, make=True) as now:
-            same = os.path.sameopenfile(now, self._descriptor) and self._place == files.through(self._descriptor)
+            same = os.path.sameopenfile(now, self._descriptor) and self._place == files.through(
+                self._descriptor, self.folder
+            )
         if self._failed:
             self._remove_unfinished()
             self._close.detach()  # what still writes for the failed save must not get another folder by this number
