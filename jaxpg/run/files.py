@@ -131,6 +131,13 @@ def is_link(name: str, parent: int | None) -> bool:
         return False
 
 
+def check_no_links(folder: int) -> None:
+    """Raises OSError, which names it, where there is a link in an open folder."""
+    for name in sorted(os.listdir(folder)):
+        if is_link(name, folder):
+            raise OSError(errno.ELOOP, f"{name}: {A_LINK}")
+
+
 @contextlib.contextmanager
 def owned(path: Path, descriptor: int) -> Iterator[None]:
     """Whatever is read or written below `path` inside is in the open folder `descriptor`."""

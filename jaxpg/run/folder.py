@@ -157,7 +157,20 @@ def owned(folder: RunFolder, say: Callable[[str], None]) -> Iterator[None]:
             path.mkdir(parents=True, exist_ok=True)
             descriptor = stack.enter_context(lock.held(path, say))
         stack.enter_context(files.owned(path, descriptor))
+        for place in (folder.checkpoints, folder.best):
+            _check_own(place)
         yield
+
+
+def _check_own(place: Path) -> None:
+    """Raises UserError where checkpoints would be written and removed through links, or there is no folder for them."""
+    try:
+        with files.opened(place) as descriptor:
+            files.check_no_links(descriptor)
+    except FileNotFoundError:
+        pass
+    except OSError as error:
+        raise UserError(f"{place}: not a folder for checkpoints ({error.strerror})") from error
 
 
 @contextlib.contextmanager
