@@ -407,4 +407,4 @@ def test_another_commit_is_noted_and_not_as_other_bits(run):
     for name in ("jaxpg", "commit", "earlier"):  # as a run of earlier days
         recorded.pop(name, None)
     (run / "versions.json").write_text(json.dumps(recorded))
-    assert "note:" not in ended(train.main, [f"resume={run}", "total_steps=160"])[1]
+    assert "commit was" not in ended(train.main, [f"resume={run}", "total_steps=160"])[1]
