@@ -16,6 +16,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from jaxpg.run.errors import UserError
+from jaxpg.run.files import opened
 
 NO_SEAL = "jaxpg:" + 16 * "0"
 SEAL = re.compile(rb"jaxpg:[0-9a-f]{16}")
@@ -68,14 +69,15 @@ def _is_ours(path: Path) -> bool:
 def move(paths: Sequence[Path], out: Path) -> None:
     """Puts the files into the folder, made where there is none, in the place of files or links of the same names.
 
-    They are renamed once all of them are there whole. A link is replaced, not followed.
+    They are renamed once all of them are there whole. A link is replaced, not followed; one in the place of the folder
+    is refused in a run folder.
 
     Raises:
       UserError: it cannot be written.
     """
     try:
         out.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryDirectory(dir=out, prefix=".export-") as place:
+        with opened(out), tempfile.TemporaryDirectory(dir=out, prefix=".export-") as place:
             for path in paths:
                 shutil.copyfile(path, Path(place) / path.name)
             for path in paths:

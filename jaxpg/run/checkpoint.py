@@ -90,9 +90,9 @@ class Checkpoints:
         _silence_what_is_left_behind()
         descriptor = files.open_folder(self.folder, make=not self._read_only)
         self._close = weakref.finalize(self, os.close, descriptor)
-        self._descriptor, self._place = descriptor, files.through(descriptor)
+        self._descriptor, self._place = descriptor, files.through(descriptor, self.folder)
         if not self._read_only:
-            _check_no_links(descriptor)
+            files.check_no_links(descriptor)
         self._manager = ocp.CheckpointManager(self._place, item_names=("state", "meta"), options=self._options)
 
     def latest(self) -> int | None:
@@ -168,7 +168,8 @@ class Checkpoints:
         A run folder that is gone is not made again.
         """
         with files.opened(self.folder, make=True) as now:
-            same = os.path.sameopenfile(now, self._descriptor) and self._place == files.through(self._descriptor)
+            same = os.path.sameopenfile(now, self._descriptor)
+        same = same and self._place == files.through(self._descriptor, self.folder)
         if self._failed:
             self._remove_unfinished()
             self._close.detach()  # what still writes for the failed save must not get another folder by this number
@@ -267,12 +268,6 @@ class Checkpoints:
         except Exception as error:  # a damaged file surfaces as any of a dozen types
             reason = _reason(error).replace(str(self._place), str(self.folder))
             raise CheckpointError(f"{self.folder / str(step)}: cannot be read ({reason})") from error
-
-
-def _check_no_links(folder: int) -> None:
-    for name in os.listdir(folder):
-        if files.is_link(name, folder):
-            raise OSError(errno.ELOOP, f"{name}: {files.A_LINK}")
 
 
 def _check_own(folder: Path) -> None:

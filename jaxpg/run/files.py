@@ -19,6 +19,7 @@ from typing import BinaryIO
 UNFINISHED = ".unfinished"  # ends the name of a file that is renamed once it is complete
 FOLDER = os.O_RDONLY | os.O_DIRECTORY
 A_LINK = "it is a link, and what is in a run folder must be its own"
+DESCRIPTORS = "/proc/self/fd"  # on Linux a path to each that is open
 NO_FILE = (errno.EINVAL, errno.ELOOP)  # of what is found where a file was expected
 
 _owned: dict[Path, int] = {}  # the folders that this process owns, by the names that they were given
@@ -130,6 +131,13 @@ def is_link(name: str, parent: int | None) -> bool:
         return False
 
 
+def check_no_links(folder: int) -> None:
+    """Raises OSError, which names it, where there is a link in an open folder."""
+    for name in sorted(os.listdir(folder)):
+        if is_link(name, folder):
+            raise OSError(errno.ELOOP, f"{name}: {A_LINK}")
+
+
 @contextlib.contextmanager
 def owned(path: Path, descriptor: int) -> Iterator[None]:
     """Whatever is read or written below `path` inside is in the open folder `descriptor`."""
@@ -147,7 +155,7 @@ def whereabouts(path: Path) -> Path:
     if descriptor is None or is_at(path, descriptor):
         return path
     name = _name(descriptor)
-    return name if name and is_at(name, descriptor) else path
+    return name if is_at(name, descriptor) else path
 
 
 def is_at(path: str | Path, descriptor: int, parent: int | None = None) -> bool:
@@ -158,32 +166,39 @@ def is_at(path: str | Path, descriptor: int, parent: int | None = None) -> bool:
         return False
 
 
-def through(descriptor: int) -> Path:
+def through(descriptor: int, path: Path) -> Path:
     """A path to an open folder for libraries that take nothing else.
 
     On Linux it leads there whatever the folder's name is or becomes. Elsewhere it is the name that it has now.
 
+    Args:
+      descriptor: of the folder.
+      path: where it was opened.
+
     Raises:
-      OSError: it has none any more.
+      OSError: it has been moved to where the system does not tell, or removed.
     """
-    path = Path(f"/proc/self/fd/{descriptor}")
-    name = path if is_at(path, descriptor) else _name(descriptor)
-    if name is None or not is_at(name, descriptor):
-        raise OSError(errno.ENOENT, "the folder has been moved or removed")
-    return name
+    for name in (_by_number(descriptor), path, _name(descriptor)):
+        if is_at(name, descriptor):
+            return name
+    raise OSError(errno.ENOENT, "the folder was moved or removed")
 
 
-def goes_through() -> bool:
-    """Whether libraries, which take some letters for patterns, need not see the names of folders."""
+def hides_names() -> bool:
+    """Whether `through` hides the names of folders, in which some libraries take some letters for patterns."""
     with opened(Path("/")) as folder:
-        return is_at(f"/proc/self/fd/{folder}", folder)
+        return is_at(_by_number(folder), folder)
 
 
-def _name(descriptor: int) -> Path | None:
-    """The name that an open folder has now, if the system tells."""
+def _by_number(descriptor: int) -> Path:
+    return Path(DESCRIPTORS, str(descriptor))
+
+
+def _name(descriptor: int) -> Path:
+    """The name that an open folder has now, as far as the system tells."""
     try:
         if hasattr(fcntl, "F_GETPATH"):
             return Path(os.fsdecode(fcntl.fcntl(descriptor, fcntl.F_GETPATH, bytes(1024)).rstrip(b"\0")))
-        return Path(os.readlink(f"/proc/self/fd/{descriptor}"))
+        return _by_number(descriptor).readlink()
     except OSError:
-        return None
+        return Path(os.devnull)

@@ -21,6 +21,7 @@ import itertools
 import json
 import os
 import re
+import stat
 import time
 from collections.abc import Callable, Iterator, Sequence
 from functools import partial
@@ -98,7 +99,7 @@ def _check_name(path: Path) -> None:
     if not str(path).isprintable():
         raise UserError(f"run_dir={str(path)!r}: expected letters that can be printed, in UTF-8")
     odd = sorted(set(PATTERNS) & set(str(path.absolute())))
-    if odd and not files.goes_through():
+    if odd and not files.hides_names():
         raise UserError(f"{path}: on this system checkpoints cannot be kept below a folder with {odd[0]} in its name")
 
 
@@ -156,7 +157,20 @@ def owned(folder: RunFolder, say: Callable[[str], None]) -> Iterator[None]:
             path.mkdir(parents=True, exist_ok=True)
             descriptor = stack.enter_context(lock.held(path, say))
         stack.enter_context(files.owned(path, descriptor))
+        for place in (folder.checkpoints, folder.best):
+            _check_own(place)
         yield
+
+
+def _check_own(place: Path) -> None:
+    """Raises UserError where checkpoints would be written and removed through links, or there is no folder for them."""
+    try:
+        with files.opened(place) as descriptor:
+            files.check_no_links(descriptor)
+    except FileNotFoundError:
+        pass
+    except OSError as error:
+        raise UserError(f"{place}: not a folder for checkpoints ({error.strerror})") from error
 
 
 @contextlib.contextmanager
@@ -209,13 +223,16 @@ def find(path: str) -> RunFolder:
 
 
 def _has_config(folder: RunFolder) -> bool:
-    """Whether there is anything of that name; raises UserError where the system does not tell."""
+    """Whether there is one; raises UserError where the system does not tell, or it is no file."""
     try:
-        os.lstat(folder.config)
+        mode = os.lstat(folder.config).st_mode
     except (FileNotFoundError, NotADirectoryError):
         return False
     except OSError as error:
-        raise UserError(f"{folder.path} is not a folder that can be read ({error.strerror})") from error
+        raise UserError(f"{folder.path} cannot be read as a run folder ({error.strerror})") from error
+    if not stat.S_ISREG(mode):
+        reason = files.A_LINK if stat.S_ISLNK(mode) else "it is no file"
+        raise UserError(f"{folder.config}: cannot be read ({reason})")
     return True
 
 

@@ -8,6 +8,8 @@ from typing import Any
 
 import yaml
 
+from jaxpg.run import files
+
 FLOAT = re.compile(r"[-+]?[0-9][0-9_]*(\.[0-9_]*)?[eE][-+]?[0-9]+$")
 
 
@@ -36,5 +38,5 @@ def dump(values: dict[str, Any]) -> str:
 
 
 def load(path: Path) -> Any:
-    """What is in a file; raises OSError, UnicodeError or yaml.YAMLError where it cannot be read."""
-    return yaml.load(path.read_text(encoding="utf-8"), Loader)
+    """What is in a file; raises OSError where it cannot be read or is a link, UnicodeError, or yaml.YAMLError."""
+    return yaml.load(files.read(path).decode(), Loader)

@@ -10,7 +10,7 @@ import contextlib
 import importlib.util
 import itertools
 import math
-import os
+import tempfile
 from collections.abc import Callable, Iterable, Iterator
 from fractions import Fraction
 from pathlib import Path
@@ -20,7 +20,7 @@ import numpy as np
 
 from envs.hints import pip_install
 from jaxpg.run.errors import UserError
-from jaxpg.run.folder import UNFINISHED
+from jaxpg.run.folder import replace
 
 TICK = Fraction(1, 100)  # of a GIF's clock [s]
 SHORTEST = 2  # ticks of a picture: what says 1 is shown slowly by browsers
@@ -76,19 +76,19 @@ def write(out: Path, images: Iterable[np.ndarray], seconds: Fraction) -> None:
 
 @contextlib.contextmanager
 def _replacing(path: Path) -> Iterator[Path]:
-    """A name beside it to write to, which then becomes its own."""
-    unfinished = path.with_name(path.name + UNFINISHED)
+    """A name elsewhere to write to; what is there in the end takes the file's place."""
     try:
+        with tempfile.TemporaryDirectory() as place:
+            unfinished = Path(place, "movie")
+            yield unfinished
+            content = unfinished.read_bytes()
         path.parent.mkdir(parents=True, exist_ok=True)
-        yield unfinished
-        with unfinished.open("rb") as file:
-            os.fsync(file.fileno())
-        unfinished.replace(path)
     except OSError as error:
         raise UserError(f"out={path}: cannot be written ({error.strerror or error})") from error
-    finally:
-        with contextlib.suppress(OSError):
-            unfinished.unlink(missing_ok=True)
+    try:
+        replace(path, content)
+    except UserError as error:
+        raise UserError(f"out={error}") from error
 
 
 def _write_mp4(path: Path, images: Iterable[np.ndarray], seconds: Fraction) -> None:

@@ -84,7 +84,7 @@ def _played(stored: StoredPolicy, policy: Policy, starts: jax.Array) -> Recordin
     episodes, (after, command, reward, value, metrics) = play(
         env, functools.partial(stored.act, policy), starts, length, seen
     )
-    first = look(jax.vmap(env.reset)(starts))
+    first = look(jax.vmap(env.reset)(jax.random.clone(starts)))  # the same starts on purpose
     looks = jax.tree.map(lambda x, rest: jnp.concatenate([x[None], rest]), first, after)
     return Recording(looks, command, reward, value, episodes.length, metrics, episodes.diverged)
 

@@ -42,7 +42,7 @@ class Follower:
         self._log = folder / f"{name}.log"
         with files.opened(folder.parent) as run, files.opened(folder, make=True), self._opened_log() as log:
             self._process = subprocess.Popen(
-                [sys.executable, "-m", "jaxpg.run.loggers.sender", name, str(files.through(run))],
+                [sys.executable, "-m", "jaxpg.run.loggers.sender", name, str(files.through(run, folder.parent))],
                 stdin=subprocess.PIPE,
                 stdout=log,
                 stderr=log,
