@@ -12,7 +12,7 @@ ROOT = Path(__file__).parent.parent
 PAGES = {path.name: path.read_text(encoding="utf-8") for path in [ROOT / "README.md", *(ROOT / "docs").glob("*.md")]}
 README = PAGES["README.md"]
 SAVED = {"own_environment.md": "balance.py"}  # pages whose first Python block is a file
-PLAYED = {"policy_in_python.md"}  # pages whose Python is about the run that their commands train
+PLAYED = {"policy_in_python.md", "deploy.md"}  # pages whose Python is about the run that their commands train
 SIZES = ("num_envs=2", "eval_episodes=2", "report=false")
 
 

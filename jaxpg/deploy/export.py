@@ -1,4 +1,4 @@
-"""From a run folder to files that were compared with JAX, or to none."""
+"""From a run folder to files that were compared with the formula of the policy, or to none."""
 
 from __future__ import annotations
 
@@ -49,8 +49,7 @@ def _check_packages(form: str, *names: str) -> None:
         try:
             importlib.import_module(name)
         except ImportError:
-            install = pip_install(*names)
-            raise UserError(f"format={form} needs {name}, which cannot be loaded: {install}") from None
+            raise UserError(f"format={form} needs {name}, which cannot be loaded: {pip_install(*names)}") from None
 
 
 FORMATS = {
