@@ -12,6 +12,7 @@ ROOT = Path(__file__).parent.parent
 PAGES = {path.name: path.read_text(encoding="utf-8") for path in [ROOT / "README.md", *(ROOT / "docs").glob("*.md")]}
 README = PAGES["README.md"]
 SAVED = {"own_environment.md": "balance.py"}  # pages whose first Python block is a file
+PLAYED = {"policy_in_python.md", "deploy.md"}  # pages whose Python is about the run that their commands train
 SIZES = ("num_envs=2", "eval_episodes=2", "report=false")
 
 
@@ -49,8 +50,10 @@ def place(tmp_path, monkeypatch):
 
 
 @pytest.mark.parametrize("page", pages_with(lambda page: blocks("python", page)))
-def test_python_examples_run(page, place):
+def test_python_examples_run(page, place, command_environment):
     folder = place(page)
+    for line in commands(page) if page in PLAYED else []:
+        run_command(line, folder, command_environment)
     for code in blocks("python", page)[page in SAVED :]:
         cwd = ROOT if page == "README.md" else folder
         result = subprocess.run([sys.executable, "-c", code], cwd=cwd, capture_output=True, text=True, check=False)
@@ -72,18 +75,16 @@ def small(arguments):
 def test_commands_run(page, place, command_environment):
     folder = place(page)
     for line in commands(page):
-        _, *arguments = shlex.split(line)
-        if {"jaxpg.train", "train"} & set(arguments):
-            arguments = small(arguments)
-        result = subprocess.run(
-            [sys.executable, *arguments],
-            cwd=folder,
-            env=command_environment,
-            capture_output=True,
-            text=True,
-            check=False,
-        )
-        assert result.returncode == 0, (line, result.stderr)
+        run_command(line, folder, command_environment)
+
+
+def run_command(line, folder, environment):
+    _, *arguments = shlex.split(line)
+    if {"jaxpg.train", "train"} & set(arguments):
+        arguments = small(arguments)
+    command = [sys.executable, *arguments]
+    result = subprocess.run(command, cwd=folder, env=environment, capture_output=True, text=True, check=False)
+    assert result.returncode == 0, (line, result.stderr)
 
 
 def test_no_command_is_left_out():

@@ -1,1 +1,1 @@
-"""Policies that leave the library: the whole controller as C, ONNX or StableHLO, each compared with JAX."""
+"""Policies that leave the library: the controller as C, ONNX or StableHLO, each compared with its formula."""

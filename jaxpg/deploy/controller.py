@@ -147,9 +147,7 @@ def _check_numbers(made: Controller) -> None:
     for name, (found, expected) in sizes.items():
         if found != expected:
             raise UserError(f"the environment's {name} has {found} entries, and must have {expected}")
-    with np.errstate(divide="ignore"):
-        statistics = [made.mean, made.scale, 1 / made.scale]
-    numbers = {"observation statistics": statistics, "network": jax.tree.leaves(made.layers)}
+    numbers = {"observation statistics": [made.mean, made.scale], "network": jax.tree.leaves(made.layers)}
     for name, arrays in (numbers | {"limits": [limits or 0.0]}).items():
         if not all(np.all(np.isfinite(array)) for array in arrays):
             raise UserError(f"the policy cannot leave the library: its {name} holds numbers that are not finite")

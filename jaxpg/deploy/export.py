@@ -1,4 +1,4 @@
-"""From a run folder to files that were compared with JAX, or to none."""
+"""From a run folder to files that were compared with the formula of the policy, or to none."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ import jax
 import numpy as np
 
 from envs.hints import pip_install
-from jaxpg.deploy import c, files, learning, onnx, reference, stablehlo
+from jaxpg.deploy import c, learning, onnx, reference, sealing, stablehlo
 from jaxpg.deploy.controller import NUM_OBSERVATIONS, Controller, commanding, controller, drawn, played
 from jaxpg.run import folder, policies
 from jaxpg.run.agents import described
@@ -49,8 +49,7 @@ def _check_packages(form: str, *names: str) -> None:
         try:
             importlib.import_module(name)
         except ImportError:
-            install = pip_install(*names)
-            raise UserError(f"format={form} needs {name}, which cannot be loaded: {install}") from None
+            raise UserError(f"format={form} needs {name}, which cannot be loaded: {pip_install(*names)}") from None
 
 
 FORMATS = {
@@ -108,7 +107,8 @@ def export(options: ExportOptions, say: Callable[[str], None]) -> None:
     formats = FORMATS if options.format == "all" else {options.format: FORMATS[options.format]}
     for way in formats.values():
         way.check()
-    out = _destination(options)
+    out = Path(options.out or Path(options.run) / "export")
+    sealing.check_folder(out)
     with physics_cache(True):
         stored = policies.load(options.run, options.checkpoint, options.agent)
     control, command = controller(stored, origin(options, stored), options.name), jax.jit(commanding(stored))
@@ -127,23 +127,8 @@ def export(options: ExportOptions, say: Callable[[str], None]) -> None:
                 apart = _learning_difference(stored, control, Path(place))
                 say(f"{'':<10} in learning differs from JAX by {apart:.1e} at most, {learning.NUM_STEPS:,} updates")
         if not options.overwrite:
-            files.check_replaceable([path.name for path in written], out)
-        files.move(written, out)
-
-
-def _destination(options: ExportOptions) -> Path:
-    """The folder to write into.
-
-    Raises:
-      UserError: a file is there; or a link, where the user has not named it: a run folder may be somebody else's.
-    """
-    inside = Path(options.run) / "export"
-    if options.out is None and inside.is_symlink():
-        raise UserError(f"{inside} is a link, which is not followed: say out=DIR")
-    out = Path(options.out or inside)
-    if out.exists() and not out.is_dir():
-        raise UserError(f"out={out}: there is a file of that name")
-    return out
+            sealing.check_replaceable([path.name for path in written], out)
+        sealing.move(written, out)
 
 
 def _say_what_is_tried(control: Controller, tried: Trial, num_played: int, say: Callable[[str], None]) -> None:

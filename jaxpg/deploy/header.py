@@ -12,8 +12,8 @@ import numpy as np
 
 from jaxpg.deploy import online
 from jaxpg.deploy.controller import FARTHEST, Controller
-from jaxpg.deploy.files import NO_SEAL
 from jaxpg.deploy.names import in_comment
+from jaxpg.deploy.sealing import NO_SEAL
 from jaxpg.features import BOUND, monomials, num_features
 
 # Included twice it is there once; another controller of the same name is an error, not left out in silence.
@@ -73,7 +73,7 @@ static inline int policy_features(const policy_real *observation, policy_real *x
     int valid = 1;
     for (int i = 0; i < POLICY_OBSERVATIONS; i++) {{
         z[i] = (observation[i] - policy_mean[i]) * policy_scale[i];
-        valid &= policy_within(z[i], (policy_real){farthest});
+        valid &= policy_finite(observation[i]) & policy_within(z[i], (policy_real){farthest});
     }}
 {features}
     return valid;

@@ -21,10 +21,7 @@ NUM_STEPS = 1000
 
 
 def steps(stored: StoredPolicy) -> Transition:
-    """Steps of one environment under the policy with its noise, `[T, 1, ...]`; no episode whose physics diverges.
-
-    A controller learns from what it is given: that a robot's numbers are sane is for its own program to see.
-    """
+    """Steps of one environment under the policy with its noise, `[T, 1, ...]`; no episode whose physics diverges."""
     networks = make_networks(stored.config, stored.env)
     vector = vectorize(stored.env, 1, stored.config.env.episode_length)
     key_reset, key_rollout = jax.random.split(jax.random.key(1))

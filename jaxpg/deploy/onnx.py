@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from jaxpg.deploy.controller import FARTHEST, Controller
-from jaxpg.deploy.files import NO_SEAL, sealed
+from jaxpg.deploy.sealing import NO_SEAL, sealed
 from jaxpg.features import BOUND
 
 OPSET = 18  # of 2022: what runtimes of robots have learned since then

@@ -14,7 +14,7 @@ import jax.export  # not part of `import jax`
 import numpy as np
 
 from jaxpg.deploy.controller import Controller
-from jaxpg.deploy.files import NO_SEAL, sealed
+from jaxpg.deploy.sealing import NO_SEAL, sealed
 
 PLATFORMS = ("cpu", "cuda", "tpu")
 

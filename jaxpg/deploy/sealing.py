@@ -6,17 +6,17 @@ about itself. A file whose seal is right is as an export left it, and another ex
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import os
 import re
 import shutil
-import stat
 import tempfile
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 from jaxpg.run.errors import UserError
-from jaxpg.run.files import opened
+from jaxpg.run.files import opened, read, through
 
 NO_SEAL = "jaxpg:" + 16 * "0"
 SEAL = re.compile(rb"jaxpg:[0-9a-f]{16}")
@@ -51,19 +51,29 @@ def check_replaceable(names: Sequence[str], out: Path) -> None:
       UserError: under one of the names there is something else than a sealed file: the user's own or changed file, a
         link, a folder.
     """
-    theirs = [name for name in names if os.path.lexists(out / name) and not _is_ours(out / name)]
+    theirs = [name for name in names if not _is_free(out / name)]
     if theirs:
         raise UserError(
-            f"out={out}: {', '.join(theirs)} there: not written by an export, or changed since; "
+            f"out={out} holds {', '.join(theirs)}, not written by an export, or changed since: nothing is written; "
             f"take another out=DIR, or overwrite=true"
         )
 
 
-def _is_ours(path: Path) -> bool:
+def _is_free(path: Path) -> bool:
     try:
-        return stat.S_ISREG(path.lstat().st_mode) and is_sealed(path.read_bytes())
-    except OSError:
+        return is_sealed(read(path))
+    except FileNotFoundError:
+        return not os.path.lexists(path)
+    except OSError:  # it cannot be read, or is no file
         return False
+
+
+def check_folder(out: Path) -> None:
+    """Raises UserError where there can be no such folder to write into: a file is there, or a link in a run folder."""
+    if out.exists() and not out.is_dir():
+        raise UserError(f"out={out}: there is a file of that name")
+    with _reported(out), contextlib.suppress(FileNotFoundError), opened(out):
+        pass
 
 
 def move(paths: Sequence[Path], out: Path) -> None:
@@ -73,15 +83,29 @@ def move(paths: Sequence[Path], out: Path) -> None:
     is refused in a run folder.
 
     Raises:
-      UserError: it cannot be written.
+      UserError: it cannot be written, or one of the names is a folder's.
     """
+    folders = [path.name for path in paths if (out / path.name).is_dir() and not (out / path.name).is_symlink()]
+    if folders:
+        raise UserError(f"out={out}: {', '.join(folders)} there is a folder")
+    with _reported(out):
+        out.parent.mkdir(parents=True, exist_ok=True)
+        with opened(out, make=True) as folder, _folder_in(folder, out) as place:
+            for path in paths:
+                shutil.copyfile(path, place / path.name)
+            for path in paths:
+                os.replace(place / path.name, path.name, dst_dir_fd=folder)
+
+
+@contextlib.contextmanager
+def _folder_in(folder: int, out: Path) -> Iterator[Path]:
+    with tempfile.TemporaryDirectory(dir=through(folder, out), prefix=".export-") as place:
+        yield Path(place)
+
+
+@contextlib.contextmanager
+def _reported(out: Path) -> Iterator[None]:
     try:
-        out.mkdir(parents=True, exist_ok=True)
-        with opened(out), tempfile.TemporaryDirectory(dir=out, prefix=".export-") as place:
-            for path in paths:
-                shutil.copyfile(path, Path(place) / path.name)
-            for path in paths:
-                (Path(place) / path.name).replace(out / path.name)
+        yield
     except OSError as error:
-        where = error.filename2 or error.filename or out
-        raise UserError(f"{where}: cannot be written ({error.strerror})") from error
+        raise UserError(f"out={out}: cannot be written ({error.strerror})") from error
