@@ -1,4 +1,4 @@
-"""`python -m jaxpg VERB ...`: every command by its verb, as `python -m jaxpg.VERB ...`.
+"""`jaxpg VERB ...` or `python -m jaxpg VERB ...`: every command by its verb, as `python -m jaxpg.VERB ...`.
 
 A script of one's own that has registered an environment has all commands with `run_command(main)`:
 
@@ -30,12 +30,17 @@ def main(arguments: Sequence[str]) -> int:
     verb, *rest = arguments or ["--help"]
     if verb in ("--help", "-h"):
         lines = [f"  {name:<10} {meaning}" for name, meaning in VERBS.items()]
-        print("\n".join(["usage: python -m jaxpg VERB [option=value] ...", "", *lines, "", "VERB --help says more"]))
+        print("\n".join(["usage: jaxpg VERB [option=value] ...", "", *lines, "", "jaxpg VERB --help says more"]))
         return 0
     if verb not in VERBS:
         raise UserError(unknown("command", verb, VERBS))
     return importlib.import_module(f"jaxpg.{verb}").main(rest)
 
 
-if __name__ == "__main__":
+def console_script() -> None:
+    """The command `jaxpg` that pip installs."""
     run_command(main)
+
+
+if __name__ == "__main__":
+    console_script()

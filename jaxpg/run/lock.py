@@ -7,7 +7,6 @@ file that was left behind locks nothing.
 from __future__ import annotations
 
 import contextlib
-import fcntl
 import os
 import platform
 import time
@@ -16,6 +15,11 @@ from pathlib import Path
 
 from jaxpg.run import files
 from jaxpg.run.errors import UserError
+
+try:
+    import fcntl
+except ImportError:  # Windows has neither these locks nor the signals that stop a run
+    raise UserError("runs need Linux or macOS; on Windows start this command in WSL, see docs/runs.md") from None
 
 NAME = "lock"
 LONGEST = 200  # bytes of an owner's name: what is in the file may be somebody else's words

@@ -62,4 +62,8 @@ def described(name: str, change: tuple[Any, Any]) -> str:
 
 def num_threads() -> int:
     """XLA's threads: results of large reductions depend on their number, so it is pinned and recorded."""
-    return int(os.environ.get("PJRT_NPROC") or len(os.sched_getaffinity(0)))
+    asked = os.environ.get("PJRT_NPROC")
+    if asked:
+        return int(asked)
+    # The cores that this process may use; where nobody knows, as on a Mac, all.
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
