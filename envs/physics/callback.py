@@ -25,8 +25,12 @@ if TYPE_CHECKING:
     import mujoco.batch
 
 KEPT = 4  # sizes of batches that keep their memory and threads
+FRAMES = ("body_ipos", "body_iquat", "geom_pos", "geom_quat", "site_pos", "site_quat")
+SIMPLE = ("body_ipos", "body_iquat", "jnt_pos", "jnt_axis")  # on which a diagonal inertia matrix of a body depends
 # MuJoCo prints a warning, and writes it into a file in the working directory, when it counts the first of its kind.
 COUNTED = 1
+# What becomes of these counts shows a divergence: MuJoCo counts it, and sets the others to 0 when it then restarts the
+# simulation. Without the restart it would go on with what is NaN or huge, and print more that nothing counts.
 DIVERGED = ("mjWARN_BADQPOS", "mjWARN_BADQVEL", "mjWARN_BADQACC", "mjWARN_BADCTRL")
 
 
@@ -73,13 +77,11 @@ class Simulations:
 
     def __init__(self, model: mujoco.MjModel, num_substeps: int, inputs: Sequence[str], outputs: Sequence[str]):
         import mujoco
-        import mujoco.batch
 
-        for name in inputs:
-            if name.startswith(MODEL) and name.removeprefix(MODEL) not in mujoco.batch.MODEL_FIELDS:
-                raise ValueError(f"{name}: with physics 'mujoco' it cannot differ between environments")
-        self._model = copy.copy(model)
-        self._model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET
+        self._model = _with_frames(
+            copy.copy(model), [name.removeprefix(MODEL) for name in inputs if name.startswith(MODEL)]
+        )
+        self._model.opt.disableflags &= ~mujoco.mjtDisableBit.mjDSBL_AUTORESET
         self._num_substeps, self._inputs, self._outputs = num_substeps, inputs, outputs
         self._rank = len(types_of(model, inputs[:1])[0].shape)
         self._initial = _initial_state(self._model)
@@ -103,7 +105,7 @@ class Simulations:
         batch.warning[...] = COUNTED
         for name, values in zip(self._inputs, rows, strict=True):
             _field(batch, name)[...] = values
-        sound = ~np.any([np.isnan(values).any(1) for values in rows], 0)
+        sound = np.all([_sound(name, values) for name, values in zip(self._inputs, rows, strict=True)], 0)
         batch.step(sound, self._num_substeps)
         sound &= (batch.warning[:, self._diverged, 1] == COUNTED).all(1)
         for name, result in zip(self._outputs, results, strict=True):
@@ -114,7 +116,36 @@ class Simulations:
     def _new_batch(self, number: int) -> mujoco.batch.Batch:
         import mujoco.batch
 
-        return mujoco.batch.Batch(self._model, number, min(number, _num_cores()))
+        batch = mujoco.batch.Batch(self._model, number, min(number, _num_cores()))
+        for name in (*self._inputs, *self._outputs):  # what is asked for before a step is filled by it
+            _field(batch, name)
+        return batch
+
+
+def _with_frames(model: mujoco.MjModel, fields: Sequence[str]) -> mujoco.MjModel:
+    """The model without MuJoCo's shortcuts for frames that coincide when it is compiled, where the fields part them.
+
+    Raises:
+      ValueError: environments cannot differ in one of the fields.
+    """
+    import mujoco.batch
+
+    for name in fields:
+        constant = name in SIMPLE and model.body_simple.any()
+        if constant or name not in mujoco.batch.MODEL_FIELDS:
+            raise ValueError(f"model.{name}: with physics 'mujoco' it cannot differ between environments")
+    if set(fields) & {*FRAMES, *SIMPLE}:
+        for flags in (model.body_sameframe, model.geom_sameframe, model.site_sameframe):
+            flags[:] = mujoco.mjtSameFrame.mjSAMEFRAME_NONE
+    return model
+
+
+def _sound(name: str, values: np.ndarray) -> np.ndarray:
+    """Where MuJoCo would not restart a simulation at once, nor a NaN get lost, `[N]`."""
+    import mujoco
+
+    within = np.abs(values) <= mujoco.mjMAXVAL if name in ("qpos", "qvel") else ~np.isnan(values)
+    return within.all(1)
 
 
 def _field(batch: mujoco.batch.Batch, name: str) -> np.ndarray:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import logging
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -11,7 +10,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from envs.physics.models import compile_model, ignored_features, load_spec, model_name
+from envs.physics.callback import COUNTED, DIVERGED
+from envs.physics.models import compile_model, ignored_features, load_spec, model_digest, model_name
 from envs.physics.step import compile_step
 
 if TYPE_CHECKING:
@@ -35,11 +35,7 @@ def load_model(path: str | Path) -> mujoco.MjModel:
 
 def check_once(model: mujoco.MjModel) -> None:
     """Logs what `check_model` finds, one warning each, when a model is met for the first time in this process."""
-    import mujoco
-
-    content = np.empty(mujoco.mj_sizeModel(model), np.uint8)
-    mujoco.mj_saveModel(model, None, content)
-    digest = hashlib.sha256(content).digest()
+    digest = model_digest(model)
     if digest not in _checked:
         _checked.add(digest)
         for line in check_model(model):
@@ -67,6 +63,7 @@ def check_model(model: mujoco.MjModel, num_steps: int = 50, tolerance: float = 1
     state = ("qpos", "qvel", "act", "qacc_warmstart") if model.na else ("qpos", "qvel", "qacc_warmstart")
     step = jax.jit(compile_step(model, inputs=(*state, "ctrl"), outputs=state))
     data = mujoco.MjData(model)
+    data.warning.number[:] = COUNTED
     random = np.random.default_rng(0)
     limit = np.where(model.actuator_ctrllimited, model.actuator_ctrlrange[:, 1], 1.0)
     ours = [jnp.asarray(getattr(data, name)) for name in state]
@@ -74,6 +71,8 @@ def check_model(model: mujoco.MjModel, num_steps: int = 50, tolerance: float = 1
         data.ctrl[:] = limit * random.uniform(-1, 1, model.nu)
         ours = step(*ours, jnp.asarray(data.ctrl))
         mujoco.mj_step(model, data)
+        if np.any(data.warning.number[[int(getattr(mujoco.mjtWarning, name)) for name in DIVERGED]] != COUNTED):
+            return [*lines, f"C MuJoCo's own motion diverges in step {number}: the timestep is too long for it"]
         for name, mine in zip(state[:2], ours, strict=False):
             true = getattr(data, name)
             error = np.max(np.abs(mine - true), initial=0.0) / max(1.0, np.max(np.abs(true), initial=0.0))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import hashlib
 import io
 import os
 from pathlib import Path
@@ -77,8 +78,24 @@ def model_name(model: mujoco.MjModel) -> str:
     return model.names.split(b"\0", 1)[0].decode() or "MuJoCo model"
 
 
+def model_digest(model: mujoco.MjModel) -> bytes:
+    """A digest of all that a compiled model holds."""
+    import mujoco
+
+    content = np.empty(mujoco.mj_sizeModel(model), np.uint8)
+    mujoco.mj_saveModel(model, None, content)
+    return hashlib.sha256(content).digest()
+
+
 def put_model(model: mujoco.MjModel):
     """MJX's model; raises MujocoModelError with the name of what MJX does not support."""
+    import mujoco
+
+    if not model.nmat and mujoco.mjtSensor.mjSENS_RANGEFINDER in model.sensor_type:
+        raise MujocoModelError(
+            f"{model_name(model)}: MJX cannot step it: rangefinder sensors in a model without a material; add "
+            '<asset><material name="any"/></asset>'
+        )
     try:
         return import_mjx().put_model(model)
     except (NotImplementedError, ValueError) as error:

@@ -18,7 +18,8 @@ import jax.numpy as jnp
 from envs.physics.callback import callback_step
 from envs.physics.fields import MODEL, STATE, as_arguments, check_names, types_of, unknown
 from envs.physics.interpreter import Program, trace
-from envs.physics.models import import_mjx, model_name, put_model
+from envs.physics.models import import_mjx, model_digest, model_name, put_model
+from envs.physics.obstacles import likely_obstacles, obstacles
 from envs.physics.rules import UnsupportedPrimitive
 from envs.physics.stages import Stage
 from envs.physics.storage import kept, name_of
@@ -32,6 +33,8 @@ logger = logging.getLogger(__name__)
 StepFn = Callable[..., tuple[jax.Array, ...]]
 
 PHYSICS = ("scalar", "mjx", "mujoco")
+
+_warned: set[bytes] = set()  # digests of the models that `_warn_once` has spoken of
 
 
 def compile_step(
@@ -75,7 +78,7 @@ def compile_step(
             program = scalar_program(model, inputs, results)
             repeated = in_tiles(program, functools.partial(_program_step, program, inputs, carried, num_substeps))
         except UnsupportedPrimitive as error:
-            logger.warning("%s: stepped by mjx.step, not as scalar equations: %s", model_name(model), error)
+            _warn_once(model, "; ".join(likely_obstacles(model)) or str(error))
             model, physics = _without_lapack(model), "mjx"
     if physics == "mujoco":
         repeated = callback_step(model, num_substeps, inputs, results)
@@ -100,10 +103,26 @@ def scalar_program(model: mujoco.MjModel, inputs: tuple[str, ...], outputs: tupl
     """
 
     def make():
+        found = obstacles(model)
+        if found and "qpos" in inputs and "qvel" in outputs:
+            raise UnsupportedPrimitive("; ".join(found))
         step, example = single_step(model, inputs, outputs)
         return trace(step, *example)
 
     return kept(name_of(model, inputs, outputs), make)
+
+
+def _warn_once(model: mujoco.MjModel, reason: str) -> None:
+    """Says that a model has no scalar equations, and what to do, when it is met for the first time in this process."""
+    digest = model_digest(model)
+    if digest not in _warned:
+        _warned.add(digest)
+        logger.warning(
+            "%s has no form as scalar equations and is stepped by mjx.step, which takes long to compile and is slow on "
+            "a CPU (physics='mujoco' is faster there): %s. See docs/physics.md",
+            model_name(model),
+            reason,
+        )
 
 
 def single_step(model: mujoco.MjModel, inputs: tuple[str, ...], outputs: tuple[str, ...]) -> tuple[Callable, list]:

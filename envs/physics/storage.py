@@ -21,6 +21,7 @@ import numpy as np
 
 from envs.physics.expressions import NUMPY, Expression, Graph
 from envs.physics.interpreter import Program
+from envs.physics.models import model_digest
 from envs.physics.rules import as_objects, pack
 
 if TYPE_CHECKING:
@@ -64,13 +65,9 @@ def kept(name: str, make: Callable[[], Program]) -> Program:
 
 def name_of(model: mujoco.MjModel, inputs: tuple[str, ...], outputs: tuple[str, ...]) -> str:
     """A name for the program of a model's step, other than that of any program that may differ from it."""
-    import mujoco
-
-    content = np.empty(mujoco.mj_sizeModel(model), np.uint8)
-    mujoco.mj_saveModel(model, None, content)
-    digest = hashlib.sha256(content)
-    digest.update(repr((inputs, outputs, jax.config.jax_enable_x64, *_makers())).encode())
-    return digest.hexdigest()
+    return hashlib.sha256(
+        model_digest(model) + repr((inputs, outputs, jax.config.jax_enable_x64, *_makers())).encode()
+    ).hexdigest()
 
 
 @functools.cache

@@ -1,0 +1,272 @@
+"""C MuJoCo's step from compiled programs: its very bits, whoever calls at the same time; divergence is to be seen."""
+
+import subprocess
+import sys
+from concurrent.futures import ThreadPoolExecutor
+
+import jax
+import jax.numpy as jnp
+import models
+import mujoco
+import numpy as np
+import pytest
+
+import envs
+from envs.physics import PHYSICS, compile_step
+from envs.physics.callback import Simulations
+from envs.physics.fields import INPUTS, OUTPUTS, types_of
+
+RICH = """<mujoco><option density="1.2" viscosity="0.1"/>
+<worldbody><geom type="plane" size="5 5 1"/><site name="wall" pos="0 0 1"/><camera/>
+<body name="hand" mocap="true"><geom size="0.1" contype="0" conaffinity="0"/></body>
+<body name="box" pos="0 0 0.3"><freejoint/><geom type="box" size="0.1 0.2 0.1"/><site name="middle"/>
+  <body pos="0.3 0 0" gravcomp="0.5"><geom type="capsule" size="0.05 0.1"/><site name="tip"/>
+  <joint name="j" axis="0 1 0" range="-1 1" limited="true" frictionloss="0.1" stiffness="1" damping="0.1"/></body>
+</body>
+<body name="ball" pos="1 0 0.1"><freejoint/><geom size="0.1"/></body></worldbody>
+<tendon><spatial name="t" range="0 0.8" limited="true"><site site="wall"/><site site="tip"/></spatial></tendon>
+<equality><weld body1="hand" body2="ball" active="false"/></equality>
+<actuator><general joint="j" dyntype="filter" dynprm="0.1"/><motor joint="j" ctrlrange="-1 1" ctrllimited="true"/>
+<motor tendon="t"/></actuator>
+<sensor><jointpos joint="j"/><accelerometer site="tip"/><touch site="middle"/><subtreelinvel body="box"/></sensor>
+</mujoco>"""
+STIFF = models.chain(models.pole(), '<general joint="pole" biastype="affine" biasprm="0 -1e7 0" gainprm="1e7"/>')
+
+
+def rich_inputs(model, number, seed=0):
+    """Random values of all inputs, `[number, ...]`, float64."""
+    random, data = np.random.default_rng(seed), mujoco.MjData(model)
+    values = {name: np.array([np.array(getattr(data, name), float)] * number) for name in INPUTS}
+    for name, scale in {"qpos": 0.3, "qvel": 1, "act": 1, "ctrl": 1, "qfrc_applied": 1, "mocap_pos": 1}.items():
+        values[name] += scale * random.normal(size=values[name].shape)
+    values["time"][:] = random.uniform(size=number)
+    values["eq_active"][:] = random.integers(0, 2, (number, 1))
+    return values
+
+
+def by_loop(model, values, num_substeps, outputs):
+    """The same by `mj_step`, each environment in data of its own."""
+    results = []
+    for place in range(len(values["qpos"])):
+        data = mujoco.MjData(model)
+        for name, x in values.items():
+            setattr(data, name, x[place])
+        for _ in range(num_substeps):
+            mujoco.mj_step(model, data)
+        results.append([np.array(getattr(data, name), float) for name in outputs])
+    return [np.stack(x).reshape(len(x), -1) for x in zip(*results, strict=True)]
+
+
+def test_every_output_is_mujocos_own():
+    """To the last bit in float64, with contacts, limits, tendons, equalities, activations and sensors."""
+    model = mujoco.MjModel.from_xml_string(RICH)
+    values = rich_inputs(model, 20)
+    with jax.enable_x64(True):
+        step = jax.jit(jax.vmap(compile_step(model, 3, inputs=INPUTS, outputs=OUTPUTS, physics="mujoco")))
+        arguments = [x.astype(bool) if name == "eq_active" else x for name, x in values.items()]
+        for name, ours, true in zip(OUTPUTS, step(*arguments), by_loop(model, values, 3, OUTPUTS), strict=True):
+            np.testing.assert_array_equal(np.reshape(ours, (20, -1)), true, err_msg=name)
+
+
+def test_nothing_is_left_of_others():
+    """The outputs of an environment are the same beside others, in another place, and after other calls."""
+    model = mujoco.MjModel.from_xml_string(RICH)
+    arrays = list(rich_inputs(model, 30).values())
+    arrays[INPUTS.index("qpos")][3, 0] = np.nan
+    order = np.random.default_rng(1).permutation(30)
+    simulations = Simulations(model, 2, INPUTS, OUTPUTS)
+
+    def step(places):
+        results = [np.empty((len(places), *x.shape), x.dtype) for x in types_of(model, OUTPUTS)]
+        simulations.step([x[places] for x in arrays], results)
+        return results
+
+    for name, here, elsewhere in zip(OUTPUTS, step(np.arange(30)), step(order), strict=True):
+        np.testing.assert_array_equal(here[order], elsewhere, err_msg=name)
+
+
+def test_threads_that_call_at_once_get_what_they_get_alone():
+    step = jax.jit(jax.vmap(compile_step(envs.make("arm").model, 5, physics="mujoco")))
+    batches = [
+        [jnp.asarray(np.random.default_rng(seed).uniform(-1, 1, (size, 2)), jnp.float32) for _ in range(3)]
+        for seed, size in enumerate((64, 64, 96))
+    ]
+    alone = [step(*batch) for batch in batches]
+
+    def differing(number):
+        both = (zip(step(*batches[number]), alone[number], strict=True) for _ in range(50))
+        return sum(not np.array_equal(ours, true) for pairs in both for ours, true in pairs)
+
+    with ThreadPoolExecutor(3) as threads:
+        assert list(threads.map(differing, range(3))) == [0, 0, 0]
+
+
+LARGE = """
+import jax, jax.numpy as jnp
+jax.config.update("jax_num_cpu_devices", 2)
+import envs
+from envs.physics import compile_step
+step = jax.vmap(compile_step(envs.make("arm").model, physics="mujoco"))
+mesh = jax.make_mesh((2,), ("shards",))
+def play(state):
+    def turn(state, _):
+        qpos, qvel = step(*state, jnp.ones_like(state[0]))
+        return (qpos, qvel - jax.lax.pmean(qvel.mean(), "shards")), None
+    return jax.lax.scan(turn, state, length=20)[0]
+where = jax.sharding.PartitionSpec("shards")
+state = (jnp.zeros((60_000, 2)),) * 2
+print(jax.jit(jax.shard_map(play, mesh=mesh, in_specs=where, out_specs=where, check_vma=False))(state)[0].shape)
+"""
+
+
+def test_large_batches_on_two_devices_end():
+    """Copies that the compiled program's own threads have to make would wait for these for ever."""
+    ended = subprocess.run([sys.executable, "-c", LARGE], capture_output=True, text=True, timeout=100, check=False)
+    assert ended.stdout == "(60000, 2)\n", ended.stderr
+
+
+def test_axes_of_several_maps_are_environments():
+    """Two seeds of three environments, with one control for all: each as it is alone."""
+    model = envs.make("arm").model
+    step = compile_step(model, physics="mujoco")
+    qpos, qvel = np.random.default_rng(0).uniform(-1, 1, (2, 2, 3, 2)).astype(np.float32)
+    ctrl = jnp.asarray([0.5, -1.0])
+    over_envs = jax.vmap(step, in_axes=(0, 0, None))
+    together = jax.jit(jax.vmap(over_envs, in_axes=(0, 0, None)))(qpos, qvel, ctrl)
+    for place in np.ndindex(2, 3):
+        for ours, alone in zip(together, step(qpos[place], qvel[place], ctrl), strict=True):
+            np.testing.assert_array_equal(ours[place], alone)
+    assert [x.shape for x in jax.vmap(step)(*[jnp.zeros((0, 2))] * 3)] == [(0, 2), (0, 2)]
+
+
+# --- divergence -------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", [name for name in INPUTS if name != "eq_active"])
+def test_a_nan_is_seen_in_its_environment_and_no_other(name):
+    model = mujoco.MjModel.from_xml_string(RICH)
+    values = rich_inputs(model, 4)
+    step = jax.jit(jax.vmap(compile_step(model, 2, inputs=INPUTS, outputs=("qpos", "qvel", "time"), physics="mujoco")))
+    sound = step(*in_float32(values))
+    values[name].reshape(4, -1)[2, -1] = np.nan
+    for ours, true in zip(step(*in_float32(values)), sound, strict=True):
+        assert np.isnan(ours[2]).all()
+        np.testing.assert_array_equal(np.delete(ours, 2, 0), np.delete(true, 2, 0))
+
+
+def in_float32(values):
+    return [jnp.asarray(x, bool if name == "eq_active" else jnp.float32) for name, x in values.items()]
+
+
+@pytest.mark.parametrize("physics", PHYSICS)
+@pytest.mark.parametrize("bad", ["nan position", "nan control", "fast"])
+def test_what_diverges_is_seen_whatever_the_physics(physics, bad):
+    model = envs.make("arm").model
+    qpos, qvel, ctrl = np.full((3, 3, 2), 0.5, np.float32)
+    array = {"nan position": qpos, "nan control": ctrl, "fast": qvel}[bad]
+    array[1, 0] = 1e12 if bad == "fast" else np.nan
+    results = jax.jit(jax.vmap(compile_step(model, 5, physics=physics)))(qpos, qvel, ctrl)
+    sane = np.all([(np.abs(x) <= mujoco.mjMAXVAL).all(1) for x in results], 0)
+    assert sane.tolist() == [True, False, True]
+
+
+def test_a_motion_that_diverges_does_not_begin_anew():
+    """MuJoCo by itself restarts it within the step; without a restart it is NaN from there on."""
+    step = jax.jit(compile_step(mujoco.MjModel.from_xml_string(STIFF), physics="mujoco"))
+    state, sane = (jnp.asarray([0.1]), jnp.zeros(1)), []
+    for _ in range(12):
+        state = step(*state, jnp.asarray([0.5]))
+        sane.append(bool(np.isfinite(np.concatenate(state)).all()))
+    assert sane == sorted(sane, reverse=True)
+    assert sane[0]
+    assert not sane[-1]
+
+
+def test_controls_are_taken_as_mjx_takes_them():
+    """Beyond its range a control is the end of it, also where it is infinite; without a range MuJoCo takes none."""
+    limited = envs.make("arm").model
+    zeros = jnp.zeros(2)
+    ours, theirs = (
+        compile_step(limited, physics=physics)(zeros, zeros, jnp.asarray([jnp.inf, -1e12]))
+        for physics in ("mujoco", "mjx")
+    )
+    np.testing.assert_allclose(np.stack(ours), np.stack(theirs), rtol=1e-5)
+    free = compile_step(models.make("double pendulum"), physics="mujoco")
+    assert np.isnan(np.stack(free(zeros, zeros, jnp.asarray([1e12])))).all()
+
+
+def test_divergence_is_not_printed_nor_written(tmp_path, monkeypatch, capfd):
+    """MuJoCo's default leaves a file in the working directory. The user's own warnings still arrive."""
+    monkeypatch.chdir(tmp_path)
+    step = jax.jit(jax.vmap(compile_step(mujoco.MjModel.from_xml_string(STIFF), 5, physics="mujoco")))
+    for position, speed, control in ((jnp.nan, 0, 0), (0, 1e12, 0), (0, 0, jnp.nan), (0.1, 0, 0.5)):
+        step(*(jnp.full((2, 1), x) for x in (position, speed, control)))
+    assert list(tmp_path.iterdir()) == []
+    assert capfd.readouterr() == ("", "")
+    model, data = models.make("cart-pole"), None
+    data = mujoco.MjData(model)
+    data.qvel[0] = 1e12
+    mujoco.mj_step(model, data)
+    assert "unstable" in capfd.readouterr().err
+
+
+# --- models that differ -----------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    "field", ["body_mass", "body_inertia", "dof_damping", "dof_armature", "actuator_gear", "opt.gravity"]
+)
+def test_environments_may_differ_in_their_models(field):
+    """Each is stepped as C MuJoCo steps a model with the field set, all else as it was."""
+    model = models.make("damping, stiffness, armature")
+    random = np.random.default_rng(0)
+    value = np.array(model.opt.gravity if field == "opt.gravity" else getattr(model, field))
+    fields = value * random.uniform(0.5, 2, (5, *value.shape))
+    states = models.random_states(model, 5)
+    inputs = ("qpos", "qvel", "ctrl", "model." + field)
+    with jax.enable_x64(True):
+        ours = jax.jit(jax.vmap(compile_step(model, inputs=inputs, physics="mujoco")))(*states, fields)
+    for place in range(5):
+        if field == "opt.gravity":
+            model.opt.gravity = fields[place]
+        else:
+            getattr(model, field)[...] = fields[place]
+        true = models.by_mujoco(model, [x[place : place + 1] for x in states])
+        for mine, other in zip(ours, true, strict=True):
+            np.testing.assert_array_equal(mine[place], other[0])
+
+
+FIELDS = ("body_mass", "body_inertia", "body_ipos", "body_iquat", "jnt_axis", "jnt_pos", "dof_damping", "dof_armature")
+FIELDS += ("actuator_gainprm", "actuator_biasprm", "actuator_ctrlrange", "site_pos", "geom_quat", "opt.timestep")
+
+
+def test_models_differ_as_they_do_by_mjx():
+    """In all fields at once, also in frames that coincide when the model is compiled, where MuJoCo has shortcuts."""
+    child = '<body pos="0.3 0 0"><joint axis="1 1 0"/><geom type="box" size="0.2 0.1 0.1"/><site name="s"/></body>'
+    servo = '<position joint="pole" kp="10" ctrlrange="-1 1"/>'
+    model = mujoco.MjModel.from_xml_string(models.chain(models.pole(child), servo))
+    random, names = np.random.default_rng(0), tuple("model." + name for name in FIELDS)
+    with jax.enable_x64(True):
+        fields = [model.opt.timestep if x == "opt.timestep" else getattr(model, x) for x in FIELDS]
+        fields = [np.asarray(x) + 0.1 * np.abs(x) + 0.01 * random.uniform(size=np.shape(x)) for x in fields]
+        fields = [
+            x / np.linalg.norm(x, axis=-1, keepdims=True) if "quat" in name or "axis" in name else x
+            for name, x in zip(FIELDS, fields, strict=True)
+        ]
+        state = random.normal(size=(2, model.nv))
+        outputs = ("qpos", "qvel", "site_xpos", "site_xmat", "geom_xmat", "ximat", "xipos")
+        ours, theirs = (
+            jax.jit(compile_step(model, 2, inputs=("qpos", "qvel", "ctrl", *names), outputs=outputs, physics=physics))(
+                *state, jnp.asarray([0.5]), *fields
+            )
+            for physics in ("mujoco", "mjx")
+        )
+    for name, mine, other in zip(outputs, ours, theirs, strict=True):
+        np.testing.assert_allclose(mine, other, rtol=1e-9, atol=1e-9, err_msg=name)
+
+
+def test_inertial_frames_that_cannot_differ_are_refused():
+    """A body alone in space has a diagonal matrix of inertia, of which MuJoCo stores no more."""
+    alone = mujoco.MjModel.from_xml_string(models.chain('<body><freejoint/><geom size="0.1"/></body>'))
+    with pytest.raises(ValueError, match=r"^model\.body_ipos: with physics 'mujoco' it cannot differ"):
+        compile_step(alone, inputs=("qpos", "qvel", "model.body_ipos"), physics="mujoco")
