@@ -83,14 +83,15 @@ class MjxEnv:
     Args:
       spec: the MuJoCo specification, already edited to the environment's options.
       num_substeps: physics steps between two actions.
-      physics: how they are computed: "scalar" (equations made of MJX's step) or "mjx" (that step itself).
+      physics: how they are computed: "scalar" (equations made of MJX's step), "mjx" (that step itself) or "mujoco" (C
+        MuJoCo's step, of which there is nothing to check).
       check: log what MJX does otherwise than C MuJoCo (`envs.physics.check_model`), which takes a second or more. The
         shipped environments leave it to the tests.
     """
 
     def __init__(self, spec: Any, num_substeps: int = 1, physics: str = "scalar", check: bool = True):
         self.model = compile_model(spec)
-        if check:
+        if check and physics != "mujoco":
             check_once(self.model)
         self.dt = self.model.opt.timestep * num_substeps
         self.physics_step = compile_step(self.model, num_substeps, physics=physics)

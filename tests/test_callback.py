@@ -107,7 +107,7 @@ jax.config.update("jax_num_cpu_devices", 2)
 import envs
 from envs.physics import compile_step
 step = jax.vmap(compile_step(envs.make("arm").model, physics="mujoco"))
-mesh = jax.make_mesh((2,), ("shards",))
+mesh = jax.sharding.Mesh(jax.devices(), ("shards",))
 def play(state):
     def turn(state, _):
         qpos, qvel = step(*state, jnp.ones_like(state[0]))

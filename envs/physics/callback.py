@@ -81,7 +81,7 @@ class Simulations:
         self._model = _with_frames(
             copy.copy(model), [name.removeprefix(MODEL) for name in inputs if name.startswith(MODEL)]
         )
-        self._model.opt.disableflags &= ~mujoco.mjtDisableBit.mjDSBL_AUTORESET
+        self._model.opt.disableflags &= ~int(mujoco.mjtDisableBit.mjDSBL_AUTORESET)
         self._num_substeps, self._inputs, self._outputs = num_substeps, inputs, outputs
         self._rank = len(types_of(model, inputs[:1])[0].shape)
         self._initial = _initial_state(self._model)
@@ -131,7 +131,7 @@ def _with_frames(model: mujoco.MjModel, fields: Sequence[str]) -> mujoco.MjModel
     import mujoco.batch
 
     for name in fields:
-        constant = name in SIMPLE and model.body_simple.any()
+        constant = name in SIMPLE and model.body_simple[model.body_dofnum > 0].any()
         if constant or name not in mujoco.batch.MODEL_FIELDS:
             raise ValueError(f"model.{name}: with physics 'mujoco' it cannot differ between environments")
     if set(fields) & {*FRAMES, *SIMPLE}:

@@ -1,7 +1,8 @@
 """One control step of a MuJoCo model, as a function of the few arrays that change.
 
 `compile_step` gives MJX's step as scalar equations (`envs.physics.interpreter`); what has no such form is stepped by
-`mjx.step` itself. Either way it is a function of one environment, and batches are made by `jax.vmap` of it.
+`mjx.step` itself, and on demand all is by C MuJoCo (`envs.physics.callback`). Either way it is a function of one
+environment, and batches are made by `jax.vmap` of it.
 """
 
 from __future__ import annotations
@@ -50,22 +51,25 @@ def compile_step(
     Args:
       model: a compiled model.
       num_substeps: physics steps of `model.opt.timestep` seconds in one control step.
-      inputs: what the step is a function of, in this order: fields of `mjx.Data` (qpos, qvel, act, ctrl, mocap_pos,
-        qfrc_applied, qacc_warmstart, ...) and, as `model.` and its name, of `mjx.Model` (model.body_mass,
-        model.dof_damping, model.opt.gravity, ...), for models that differ between the environments. All else is as
-        `mjx.make_data` and the model have it.
-      outputs: the fields of `mjx.Data` that the step returns, in this order, as they are after the last substep. As
-        in MuJoCo, what is derived from the positions (xpos, site_xpos, sensordata, ...) belongs to the state before
-        that substep.
-      physics: "scalar": scalar equations, or `mjx.step` with a logged line that says why if the model has none;
-        "mjx": `mjx.step`; "mujoco": C MuJoCo's step, called back for each environment, which is slow.
+      inputs: what the step is a function of, in this order: fields of `mjx.Data` (`fields.INPUTS`: qpos, qvel, act,
+        ctrl, mocap_pos, qfrc_applied, qacc_warmstart, ...) and, as `model.` and its name, of `mjx.Model`
+        (model.body_mass, model.dof_damping, model.opt.gravity, ...), for models that differ between the environments.
+        All else is as `mjx.make_data` and the model have it.
+      outputs: the fields of `mjx.Data` (`fields.OUTPUTS`) that the step returns, in this order, as they are after the
+        last substep. As in MuJoCo, what is derived from the positions (xpos, site_xpos, sensordata, ...) belongs to the
+        state before that substep.
+      physics: "scalar": scalar equations, or `mjx.step` with a logged line that names the model's feature if it has
+        none; "mjx": `mjx.step`; "mujoco": C MuJoCo's step in double precision, which cannot be differentiated.
 
     Returns:
-      A function of the inputs (SI units; ctrl in the actuators' units) of one environment. A NaN in the state stays
-      in the state.
+      A function of the inputs (SI units; ctrl in the actuators' units) of one environment, in jax's default precision.
+      A NaN in the state stays in the state. By "mujoco" all that is returned of an environment is NaN where it has
+      diverged, as `callback_step` says. The function raises ValueError for a shape and TypeError for a dtype or a number
+      of arguments that does not fit the inputs.
 
     Raises:
-      ValueError: the model's state is not among the inputs (activations), or `physics` is unknown.
+      ValueError: a name is unknown (with the nearest one), is not what a step is a function of, or cannot differ between
+        environments; the model's state is not among the inputs (activations); or `physics` is unknown.
       MujocoModelError: MJX cannot step the model.
     """
     if physics not in PHYSICS:
