@@ -1,13 +1,14 @@
 """Claim: MJX models step at the speed of hand-written equations, and many times faster than C MuJoCo on all cores.
 
-    python experiments/physics_throughput.py [--envs 1 64 1024 16384] [--repeats 7]
+    python experiments/physics_throughput.py [--envs 1 64 1024 16384] [--repeats 7] [--models pendulum arm ...]
 
 For a pendulum, a two-link arm and a seven-joint arm with and without joint limits, physics steps per second of
 
     scalar   scalar equations made of MJX's step (envs.physics.compile_step), batched by vmap
     mjx      vmap(mjx.step); of the seven-joint arm with few environments only, as it makes a few dozen steps a second
     hand     the pendulum's equation of motion, written down, batched by vmap
-    C        mujoco.rollout on all cores
+    mujoco   C MuJoCo's step called from the compiled program, one call for each step of all environments, on all cores
+    C        mujoco.rollout on all cores, one call for all steps of all environments
 
 all in one process, one after the other in each round, so that a ratio compares neighbours in time. Prints one table
 and writes results/physics_throughput.json: the median of the rounds with the smallest and the largest, seconds to trace
@@ -120,6 +121,7 @@ def contestants(name: str, model: mujoco.MjModel, num_envs: int) -> dict[str, An
         found["mjx"] = Compiled(lambda: compile_step(model, physics="mjx"), model, num_envs, few)
     if name == "pendulum":
         found["hand"] = Compiled(lambda: pendulum_by_hand, model, num_envs)
+    found["mujoco"] = Compiled(lambda: compile_step(model, physics="mujoco"), model, num_envs)
     return found | {"C": InC(model, num_envs)}
 
 
@@ -161,24 +163,27 @@ def show(row: dict[str, Any]) -> None:
     )
 
 
+MODELS = {
+    "pendulum": lambda: envs.make("pendulum").model,
+    "arm": lambda: envs.make("arm").model,
+    "panda": lambda: panda(limits=False),
+    "panda with limits": lambda: panda(limits=True),
+}
+
+
 def main(arguments: Sequence[str]) -> None:
     parser = Parser(__doc__)
     parser.add_argument("--envs", type=count, nargs="+", default=[1, 64, 1024, 16_384])
     parser.add_argument("--repeats", type=count, default=7)
+    parser.add_argument("--models", nargs="+", default=list(MODELS), choices=MODELS)
     options = parser.parse_args(arguments)
-    models = {
-        "pendulum": envs.make("pendulum").model,
-        "arm": envs.make("arm").model,
-        "panda": panda(limits=False),
-        "panda with limits": panda(limits=True),
-    }
     print(
         "model, environments, method, M steps/s (range), scalar is faster by (range), s to trace, to compile, bytes/env"
     )
     rows = []
-    for name, model in models.items():
+    for name in options.models:
         for num_envs in options.envs:
-            found = measure(name, model, num_envs, options.repeats)
+            found = measure(name, MODELS[name](), num_envs, options.repeats)
             rows += found
             for row in found:
                 show(row)

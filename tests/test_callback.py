@@ -1,5 +1,7 @@
 """C MuJoCo's step from compiled programs: its very bits, whoever calls at the same time; divergence is to be seen."""
 
+import functools
+import json
 import subprocess
 import sys
 from concurrent.futures import ThreadPoolExecutor
@@ -9,12 +11,19 @@ import jax.numpy as jnp
 import models
 import mujoco
 import numpy as np
+import optax
 import pytest
+from processes import outcome
 
 import envs
 from envs.physics import PHYSICS, compile_step
 from envs.physics.callback import Simulations
 from envs.physics.fields import INPUTS, OUTPUTS, types_of
+from jaxpg.actor_critic import actor_critic, td
+from jaxpg.networks import mlp_networks
+from jaxpg.shards import AXIS, sharded
+from jaxpg.training import train_scan
+from jaxpg.vector_env import vectorize
 
 RICH = """<mujoco><option density="1.2" viscosity="0.1"/>
 <worldbody><geom type="plane" size="5 5 1"/><site name="wall" pos="0 0 1"/><camera/>
@@ -139,6 +148,63 @@ def test_axes_of_several_maps_are_environments():
     assert [x.shape for x in jax.vmap(step)(*[jnp.zeros((0, 2))] * 3)] == [(0, 2), (0, 2)]
 
 
+# --- equal runs have equal bits ---------------------------------------------------------------------------------------
+
+
+@functools.cache
+def training(num_shards):
+    """Parameters after some updates of 32 arms that C MuJoCo moves, from a key."""
+    env, several = envs.make("arm", physics="mujoco"), num_shards > 1
+    batch, networks = vectorize(env, 32 // num_shards, 20), mlp_networks(env.observation_size, env.action_size, (8,))
+    optimizer, axis_name = optax.adam(0.01), AXIS if several else None
+    algorithm = actor_critic(batch, networks, optimizer, td(0.9, 0.9, 5), axis_name=axis_name)
+    algorithm = sharded(algorithm, num_shards, jax.devices()) if several else algorithm
+    return jax.jit(lambda key: jax.tree.leaves(train_scan(algorithm, key, num_updates=20)[0].params))
+
+
+def digest(num_shards, seed=0):
+    return b"".join(np.asarray(x).tobytes() for x in training(num_shards)(jax.random.key(seed)))
+
+
+def test_two_shards_learn_the_same_each_time():
+    """Their devices call MuJoCo at the same time."""
+    assert len({digest(2) for _ in range(10)}) == 1
+
+
+def test_two_seeds_learn_the_same_each_time():
+    """As do groups of agents in threads of their own."""
+    alone = [digest(1, seed) for seed in (0, 1)]
+    assert alone[0] != alone[1]
+    with ThreadPoolExecutor(2) as threads:
+        for _ in range(5):
+            assert list(threads.map(lambda seed: digest(1, seed), (0, 1))) == alone
+
+
+TINY = ("env=arm", "env.physics=mujoco", "env.episode_length=8", "num_envs=8", "num_steps=8", "total_steps=640")
+TINY += ("algo.epochs=1", "algo.minibatches=1", "log_interval=64", "eval_interval=320", "eval_episodes=2")
+
+
+@pytest.mark.study
+@pytest.mark.parametrize(
+    "options",
+    [("algo.num_shards=2",), ("num_seeds=2", "algo.num_shards=1"), ("sweep.algo.gamma=[0.8,0.9]", "algo.num_shards=1")],
+    ids=["shards", "seeds", "sweep"],
+)
+def test_twenty_equal_commands_end_with_equal_bits(options, command, tmp_path):
+    ends = set()
+    for number in range(20):
+        folder = tmp_path / str(number)
+        ended = command("train", *TINY, *options, "report=false", f"run_dir={folder}")
+        assert ended.returncode == 0, ended.stderr
+        ends.add(json.dumps([outcome(agent) for agent in agents_of(folder)]))
+    assert len(ends) == 1
+
+
+def agents_of(folder):
+    """The run folders of the agents that a command has trained."""
+    return sorted(path.parent for path in folder.rglob("metrics.jsonl"))
+
+
 # --- divergence -------------------------------------------------------------------------------------------------------
 
 
@@ -158,14 +224,19 @@ def in_float32(values):
     return [jnp.asarray(x, bool if name == "eq_active" else jnp.float32) for name, x in values.items()]
 
 
+@functools.cache
+def arm_steps(physics):
+    """Control steps of three arms."""
+    return jax.jit(jax.vmap(compile_step(envs.make("arm").model, 5, physics=physics)))
+
+
 @pytest.mark.parametrize("physics", PHYSICS)
 @pytest.mark.parametrize("bad", ["nan position", "nan control", "fast"])
 def test_what_diverges_is_seen_whatever_the_physics(physics, bad):
-    model = envs.make("arm").model
     qpos, qvel, ctrl = np.full((3, 3, 2), 0.5, np.float32)
     array = {"nan position": qpos, "nan control": ctrl, "fast": qvel}[bad]
     array[1, 0] = 1e12 if bad == "fast" else np.nan
-    results = jax.jit(jax.vmap(compile_step(model, 5, physics=physics)))(qpos, qvel, ctrl)
+    results = arm_steps(physics)(qpos, qvel, ctrl)
     sane = np.all([(np.abs(x) <= mujoco.mjMAXVAL).all(1) for x in results], 0)
     assert sane.tolist() == [True, False, True]
 
@@ -184,15 +255,11 @@ def test_a_motion_that_diverges_does_not_begin_anew():
 
 def test_controls_are_taken_as_mjx_takes_them():
     """Beyond its range a control is the end of it, also where it is infinite; without a range MuJoCo takes none."""
-    limited = envs.make("arm").model
-    zeros = jnp.zeros(2)
-    ours, theirs = (
-        compile_step(limited, physics=physics)(zeros, zeros, jnp.asarray([jnp.inf, -1e12]))
-        for physics in ("mujoco", "mjx")
-    )
+    ctrl = np.array([[np.inf, -1e12], [2.0, -2.0], [-np.inf, 0.0]], np.float32)
+    ours, theirs = (arm_steps(physics)(*np.zeros((2, 3, 2), np.float32), ctrl) for physics in ("mujoco", "mjx"))
     np.testing.assert_allclose(np.stack(ours), np.stack(theirs), rtol=1e-5)
     free = compile_step(models.make("double pendulum"), physics="mujoco")
-    assert np.isnan(np.stack(free(zeros, zeros, jnp.asarray([1e12])))).all()
+    assert np.isnan(np.stack(free(np.zeros(2), np.zeros(2), np.array([1e12])))).all()
 
 
 def test_divergence_is_not_printed_nor_written(tmp_path, monkeypatch, capfd):
@@ -253,6 +320,9 @@ def test_models_differ_as_they_do_by_mjx():
             x / np.linalg.norm(x, axis=-1, keepdims=True) if "quat" in name or "axis" in name else x
             for name, x in zip(FIELDS, fields, strict=True)
         ]
+        for name, x in zip(FIELDS, fields, strict=True):
+            if name.startswith("body"):
+                x[0] = getattr(model, name)[0]  # the world's
         state = random.normal(size=(2, model.nv))
         outputs = ("qpos", "qvel", "site_xpos", "site_xmat", "geom_xmat", "ximat", "xipos")
         ours, theirs = (

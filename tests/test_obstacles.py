@@ -131,10 +131,10 @@ WRAPPED = models.chain(
         (models.chain(models.pole(joint='frictionloss="1"')), ["frictionloss", "iterations"]),
     ],
 )
-def test_the_feature_is_named_once(xml, words, caplog):
+def test_the_feature_is_named_once(xml, words, caplog, monkeypatch):
     """With what it costs and where to read on, however many steps are made of the model."""
     model = mujoco.MjModel.from_xml_string(xml)
-    step._warned.clear()
+    monkeypatch.setattr(step, "_warned", set())
     with caplog.at_level(logging.WARNING):
         for num_substeps in (1, 2):
             compile_step(model, num_substeps)
