@@ -16,7 +16,7 @@ import pytest
 from processes import outcome
 
 import envs
-from envs.physics import PHYSICS, compile_step
+from envs.physics import PHYSICS, MujocoModelError, compile_step
 from envs.physics.callback import Simulations
 from envs.physics.fields import INPUTS, OUTPUTS, types_of
 from jaxpg.actor_critic import actor_critic, td
@@ -86,9 +86,7 @@ def test_nothing_is_left_of_others():
     simulations = Simulations(model, 2, INPUTS, OUTPUTS)
 
     def step(places):
-        results = [np.empty((len(places), *x.shape), x.dtype) for x in types_of(model, OUTPUTS)]
-        simulations.step([x[places] for x in arrays], results)
-        return results
+        return simulations.results(types_of(model, OUTPUTS), *(x[places] for x in arrays))
 
     for name, here, elsewhere in zip(OUTPUTS, step(np.arange(30)), step(order), strict=True):
         np.testing.assert_array_equal(here[order], elsewhere, err_msg=name)
@@ -340,3 +338,9 @@ def test_inertial_frames_that_cannot_differ_are_refused():
     alone = mujoco.MjModel.from_xml_string(models.chain('<body><freejoint/><geom size="0.1"/></body>'))
     with pytest.raises(ValueError, match=r"^model\.body_ipos: with physics 'mujoco' it cannot differ"):
         compile_step(alone, inputs=("qpos", "qvel", "model.body_ipos"), physics="mujoco")
+
+
+def test_a_model_that_cannot_be_batched_is_named():
+    sleepy = models.chain(models.pole(), option='<option><flag sleep="enable"/></option>')
+    with pytest.raises(MujocoModelError, match=r"mujoco\.batch cannot step it: .*sleep"):
+        compile_step(mujoco.MjModel.from_xml_string(sleepy), physics="mujoco")

@@ -19,6 +19,7 @@ import numpy as np
 from jax.experimental.buffer_callback import buffer_callback
 
 from envs.physics.fields import MODEL, types_of
+from envs.physics.models import MujocoModelError, model_name
 
 if TYPE_CHECKING:
     import mujoco
@@ -48,22 +49,18 @@ def callback_step(
 
     Raises:
       ValueError: among the inputs is a field of the model that `mujoco.batch` has once for all environments.
+      MujocoModelError: `mujoco.batch` cannot step the model, as where bodies may fall asleep.
     """
     simulations = Simulations(model, num_substeps, inputs, outputs)
 
-    def by_buffers(_, results, *arrays):
+    def fill(_, results, *arrays):
         simulations.step(list(map(np.asarray, arrays)), list(map(np.asarray, results)))
-
-    def by_copies(*arrays):
-        arrays = list(map(np.asarray, arrays))
-        results = [np.empty((*simulations.leading(arrays), *x.shape), x.dtype) for x in types_of(model, outputs)]
-        simulations.step(arrays, results)
-        return results
 
     def step(*arrays):
         types, method = types_of(model, outputs), {"vmap_method": "broadcast_all"}
-        here = buffer_callback(by_buffers, types, **method)
-        elsewhere = functools.partial(jax.pure_callback, by_copies, types, **method)
+        make = functools.partial(simulations.results, types)
+        here = buffer_callback(fill, types, **method)
+        elsewhere = functools.partial(jax.pure_callback, make, types, **method)
         return tuple(jax.lax.platform_dependent(*arrays, cpu=here, default=elsewhere))
 
     return step
@@ -88,17 +85,27 @@ class Simulations:
         self._diverged = [int(getattr(mujoco.mjtWarning, name)) for name in DIVERGED]
         self._batch = functools.lru_cache(maxsize=KEPT)(self._new_batch)
         self._lock = threading.Lock()
+        try:
+            self._batch(1)
+        except ValueError as error:
+            raise MujocoModelError(f"{model_name(model)}: mujoco.batch cannot step it: {error}") from error
 
-    def leading(self, arrays: Sequence[np.ndarray]) -> tuple[int, ...]:
-        """The leading axes of the inputs: those of the environments."""
-        return arrays[0].shape[: arrays[0].ndim - self._rank]
+    def results(self, types: Sequence[jax.ShapeDtypeStruct], *arrays: jax.Array) -> list[np.ndarray]:
+        """The outputs of all environments, from the inputs of all: leading axes are theirs."""
+        arrays = tuple(map(np.asarray, arrays))
+        found = [np.empty((*self._leading(arrays), *x.shape), x.dtype) for x in types]
+        self.step(arrays, found)
+        return found
 
     def step(self, arrays: Sequence[np.ndarray], results: Sequence[np.ndarray]) -> None:
-        """Fills the results with the outputs of all environments, from the inputs of all."""
-        number = int(np.prod(self.leading(arrays), dtype=int))
+        """Fills the results as `results` makes them."""
+        number = int(np.prod(self._leading(arrays), dtype=int))
         if number:
             with self._lock, np.errstate(over="ignore"):  # what is too large for float32 becomes inf
                 self._step(self._batch(number), [x.reshape(number, -1) for x in arrays], results)
+
+    def _leading(self, arrays: Sequence[np.ndarray]) -> tuple[int, ...]:
+        return arrays[0].shape[: arrays[0].ndim - self._rank]
 
     def _step(self, batch: mujoco.batch.Batch, rows: list[np.ndarray], results: Sequence[np.ndarray]) -> None:
         batch.state[...] = self._initial
