@@ -30,6 +30,8 @@ import envs
 from envs.base import interface
 from envs.options import OptionError, build
 
+LARGEST = 1e10  # as in training, after MuJoCo's mjMAXVAL
+
 
 class Single(gymnasium.Env):
     """One environment of brax's interface as Gymnasium's.
@@ -169,13 +171,16 @@ def compiled(env: Any) -> Compiled:
 
 
 def finite_step(env: Any, state: Any, action: jax.Array) -> Any:
-    """The environment's step; what is not finite is the end: the observation before it, no reward, terminated."""
+    """The environment's step; a physics that diverges is the end: the observation before it, no reward, terminated.
+
+    What is not finite or beyond `LARGEST` counts as diverged.
+    """
     after = env.step(state, action)
-    finite = jnp.isfinite(after.obs).all() & jnp.isfinite(after.reward)
+    sound = (jnp.abs(after.obs) <= LARGEST).all() & (jnp.abs(after.reward) <= LARGEST) & jnp.isfinite(after.done)
     return after.replace(
-        obs=jnp.where(finite, after.obs, state.obs),
-        reward=jnp.where(finite, after.reward, 0.0),
-        done=jnp.where(finite, after.done, 1.0),
+        obs=jnp.where(sound, after.obs, state.obs),
+        reward=jnp.where(sound, after.reward, 0.0),
+        done=jnp.where(sound, after.done, 1.0),
     )
 
 

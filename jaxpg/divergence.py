@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 
 BOUND = 1e10  # mjMAXVAL, MuJoCo's own for positions, velocities and accelerations
-FAR = 100.0  # deviations from the mean of the observations, beyond which nothing is learned from
+FAR = 30.0  # deviations from the mean of the observations, beyond which nothing is learned from
 PHYSICS = ("qpos", "qvel", "qacc", "q", "qd")  # what MuJoCo looks at, and brax's names of the same
 
 

@@ -74,8 +74,8 @@ def online_actor_critic(
       normalize_observations: feed the networks (s - mean) / std with running statistics, updated after `num_steps`.
 
     A step whose physics diverges is not learned from; nor, with normalized observations, one further than
-    `jaxpg.divergence.FAR` deviations from their mean, as a joint that explodes is before. The steps before those have
-    been learned from when that is seen: they were like any others.
+    `jaxpg.normalization.REACH` deviations from their mean, as a joint that explodes is before: nothing shortens what
+    it would do. The steps before those have been learned from when that is seen; they were like any others.
 
     Returns:
       `Algorithm(init, step)` with the metrics of `actor_critic`, as far as there are some.
@@ -173,7 +173,8 @@ def learned_from(transition: Transition, normalizer: PyTree, normalized: bool) -
     sound = (transition.diverged == 0) & jnp.all(jnp.isfinite(transition.u), axis=-1)
     if not normalized:
         return sound
-    at_home = [normalization.near(normalizer, x, divergence.FAR) for x in (transition.obs, transition.next_obs)]
+    reach = normalization.REACH
+    at_home = [normalization.near(normalizer, x, reach) for x in (transition.obs, transition.next_obs)]
     return sound & at_home[0] & at_home[1]
 
 

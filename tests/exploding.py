@@ -17,6 +17,7 @@ class ExplodingConfig:
     episode_length: int = option(30, "steps until the time limit", at_least=1)
     share: float = option(0.1, "share of the joints that are unstable", at_least=0, at_most=1)
     growth: float = option(10.0, "factor of an unstable joint's error in a step", above=1)
+    unit: float = option(1.0, "of the observation", above=0)
 
 
 class Joint(NamedTuple):
@@ -42,7 +43,7 @@ class Servo:
         return initial_state(Joint(angle, unstable), self.observe(angle))
 
     def observe(self, angle):
-        return angle[None]
+        return self.config.unit * angle[None]
 
     def reward(self, angle):
         return -((angle - 0.5) ** 2)

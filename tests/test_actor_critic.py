@@ -9,6 +9,7 @@ import optax
 import pytest
 from probes import Constant, Counter, Target
 
+from envs.base import State
 from jaxpg import normalization
 from jaxpg.actor_critic import (
     BASELINES,
@@ -253,3 +254,34 @@ def test_state_fields_are_all_carried():
     state, _ = train_scan(algorithm, new_key(), 2)
     copy = jax.tree.map(lambda x: jnp.array(np.asarray(x)), state)
     equal_bits(train_scan(algorithm, new_key(), 2, state), train_scan(algorithm, new_key(), 2, copy))
+
+
+class Sides:
+    """Observes on which side it is, in some unit and from some origin; the best action is 0.8 times the side."""
+
+    observation_size = action_size = 1
+
+    def __init__(self, unit, origin=0.0):
+        self.unit, self.origin = unit, origin
+
+    def reset(self, rng):
+        x, zero = jax.random.choice(rng, jnp.array([-1.0, -0.5, 0.5, 1.0])), jnp.zeros(())
+        return State(x, self.observe(x), zero, zero)
+
+    def observe(self, x):
+        return (self.unit * (self.origin + x))[None]
+
+    def step(self, state, action):
+        reward = -((action[0] - 0.8 * jnp.sign(state.pipeline_state)) ** 2)
+        return state.replace(reward=reward)
+
+
+@pytest.mark.parametrize(("unit", "origin"), [(1.0, 0.0), (1e-6, 0.0), (1e-3, 3.0), (1e5, 0.0), (0.1, 1e5)])
+def test_units_of_the_observations_do_not_matter(unit, origin):
+    """Micrometres, an offset of 10^4 with a deviation of 0.1: the sides are told apart as in units of size 1."""
+    networks, made = make(Sides(unit, origin), td(0.5, 0.9, 5), num_envs=32, episode_length=5, learning_rate=1e-2)
+    state, _ = jax.jit(lambda: train_scan(made, new_key(), 150))()
+    obs = jax.vmap(Sides(unit, origin).observe)(jnp.array([-1.0, -0.5, 0.5, 1.0]))
+    action = deterministic_policy(networks, state.params, state.normalizer)(obs)[:, 0]
+    assert (np.sign(action) == [-1, -1, 1, 1]).all()
+    assert (np.abs(action) > 0.4).all()

@@ -157,6 +157,18 @@ def test_a_few_diverged_episodes_are_counted_and_no_more(program, tmp_path):
     assert np.isfinite([numbers["mean"], numbers["stderr"]]).all()
 
 
+def test_an_observation_out_of_bounds_ends_in_one_line(program, tmp_path):
+    """Of a sound environment: which observation, its size, and what would be right; nothing is trained."""
+    result = program("train", "env=exploding-servo", "env.unit=1e20", *TINY, f"run_dir={tmp_path / 'run'}")
+    assert result.returncode == 2, result.stdout + result.stderr
+    said = result.stdout + result.stderr
+    assert "observation 0 (observation_0) is " in said
+    assert "e+19 after a reset" in said or "e+20 after a reset" in said
+    assert "in units in which it is smaller" in said
+    assert "Traceback" not in said
+    assert not (tmp_path / "run" / "metrics.jsonl").exists()
+
+
 def test_a_run_all_of_whose_episodes_diverge_calls_no_policy_best(program, tmp_path):
     folder = tmp_path / "all"
     result = program("train", "env=exploding-servo", "env.share=1", "stop_return=-1e9", *TINY, f"run_dir={folder}")

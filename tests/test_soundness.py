@@ -226,8 +226,8 @@ def test_each_agent_is_named_once():
     assert said == [
         f"note: update 12: {names[2]} is not finite, seed 7; such updates are left out",
         f"note: update 11: {names[1]} is not finite, seed 8; such updates are left out",
-        "note: update 13: the physics of environment 5, seed 7 diverged; its episode ended there, and diverged in "
-        "metrics.jsonl counts such",
+        "note: update 13: the physics of environment 5, seed 7 diverged: a number is not finite or beyond 1e+10; its "
+        "episode ended there and is not learned from, and diverged in metrics.jsonl counts such",
     ]
     assert watch.problem == f"update 12: {names[2]} is not finite, seed 7"
     assert not watch.nobody_goes_on

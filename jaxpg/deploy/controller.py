@@ -1,8 +1,9 @@
 """A trained policy as what a robot runs: physical observations in, physical commands out, and nothing of JAX.
 
-    command = limit * clip(squash(f(phi(z))), -1, 1),    z = (s - m) / sqrt(v + epsilon)
+    command = limit * clip(squash(f(phi(z))), -1, 1),    z = (s - m) * scale
 
-with the features phi and the network f of the actor, and squash = tanh or nothing. Every format is written from here.
+with the features phi and the network f of the actor, the scale of `jaxpg.normalization`, and squash = tanh or nothing.
+Every format is written from here.
 
 An observation is valid if all |z_i| <= `FARTHEST`: none is NaN, infinite, or so large that floats run out of range. Of
 one that is not valid, or whose action is not finite, every command is 0.

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from jaxpg.divergence import BOUND
 from jaxpg.run.agents import described_agent
 from jaxpg.run.config import Config
 from jaxpg.run.folder import jsonable
@@ -98,9 +99,11 @@ class Watch:
             self._diverged = True
             agent, at = diverged[0]
             environment = int(np.asarray(metrics["diverged_env"])[agent, at])
+            where = f"the physics of environment {environment}{self._of(agent)}"
             self._say(
-                f"note: update {first_update[agent] + at:,}: the physics of environment {environment}"
-                f"{self._of(agent)} diverged; its episode ended there, and diverged in metrics.jsonl counts such"
+                f"note: update {first_update[agent] + at:,}: {where} diverged: a number is not finite or beyond "
+                f"{BOUND:.0e}; its episode ended there and is not learned from, and diverged in metrics.jsonl counts "
+                "such"
             )
 
     def _note(self, agent: int, first_update: int, metrics: Metrics) -> None:

@@ -14,6 +14,8 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
+from envs.base import interface
+from jaxpg.divergence import BOUND
 from jaxpg.run import agents, figures, folder, lock, memory, registered, results, same_run, versions
 from jaxpg.run import config as configuration
 from jaxpg.run.cache import compilation_cache, physics_cache
@@ -77,7 +79,23 @@ def _begin(config: Config, env: Any, run_folder: RunFolder) -> int:
     )
     session = Session(config, schedule, run_folder, display)
     program, seconds = _compile(session, env)
-    return _train(session, program, program.init(), seconds)
+    state = program.init()
+    _check_start(np.asarray(state.train.env_state.obs), env)
+    return _train(session, program, state, seconds)
+
+
+def _check_start(obs: np.ndarray, env: Any) -> None:
+    """Raises UserError where an observation of the first episodes, `[S, N, n]`, is one of a physics that diverged."""
+    outside = ~(np.abs(obs) <= BOUND)
+    if outside.any():
+        place = int(np.argmax(outside.any(axis=(0, 1))))
+        names = interface(env).observations
+        name = f" ({names[place]})" if place < len(names) else ""
+        size = obs[..., place][outside[..., place]][0]
+        raise UserError(
+            f"observation {place}{name} is {size:.3g} after a reset: numbers that are not finite or beyond {BOUND:.0e} "
+            f"count as diverged; give it in units in which it is smaller"
+        )
 
 
 def resume(given: Mapping[str, Any]) -> int:
