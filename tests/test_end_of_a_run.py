@@ -25,6 +25,12 @@ CHUNKS_OF_THREE = f"log_interval={3 * STEPS}"
 KEY = jax.random.key(0)
 
 
+def configured(*options):
+    """The configuration of such a run, but for these options."""
+    given = dict(option.split("=") for option in (*SIZES, *options))
+    return compose([f"{name}={value}" for name, value in given.items()])
+
+
 def same(a, b):
     jax.tree.map(np.testing.assert_array_equal, a, b)
 
@@ -39,14 +45,14 @@ def updates_of(folder):
 @pytest.mark.parametrize("log_interval", [1, 23, 24, 25, 1000])
 @pytest.mark.parametrize("total_steps", [1, 8, 159, 160, 161])
 def test_intervals_do_not_change_the_number_of_updates(total_steps, log_interval):
-    schedule = plan(compose([*SIZES[:-4], f"total_steps={total_steps}", f"log_interval={log_interval}"]))
+    schedule = plan(configured(f"total_steps={total_steps}", f"log_interval={log_interval}"))
     assert schedule.num_updates == -(-total_steps // STEPS)
 
 
 @pytest.mark.parametrize("log_interval", [1, 24, 25, 1000])
 def test_lines_come_at_the_same_updates_wherever_a_run_goes_on(log_interval):
     """After multiples of the chunk and at the end, each reached from anywhere before it."""
-    schedule = plan(compose([*SIZES, f"log_interval={log_interval}"]))
+    schedule = plan(configured(f"log_interval={log_interval}"))
     ends = {*range(schedule.chunk, UPDATES, schedule.chunk), UPDATES}
     for update in range(UPDATES):
         assert update + schedule.until_next_line(update) == min(end for end in ends if end > update)
@@ -55,7 +61,7 @@ def test_lines_come_at_the_same_updates_wherever_a_run_goes_on(log_interval):
 @pytest.mark.parametrize("agents", [(), ("num_seeds=2", "vmap_seeds=2"), ("num_seeds=2",)])
 def test_one_program_makes_parts_of_any_length(agents):
     """To the bit the training in one piece; and only as many rows of metrics as updates."""
-    config = compose([*SIZES, *agents])
+    config = configured(*agents)
     with jax.debug_key_reuse(False):  # see test_vmapped_seeds_are_single_seeds
         compiled = compile_program(config, make_env(config), chunk=5)
     begun = compiled.init().train
@@ -73,17 +79,22 @@ def test_one_program_makes_parts_of_any_length(agents):
         same(trained(numbers), whole)
 
 
+def close(a, b):
+    """To rounding: XLA does not make a loop of a single round, whose numbers it may fuse in another way."""
+    np.testing.assert_allclose(a, b, rtol=1e-5, atol=1e-6)
+
+
 def test_a_chunk_is_the_scan_of_its_updates():
-    config = compose(SIZES)
+    config = configured()
     algorithm = make_algorithm(config, make_env(config))
     begun = initial_state(algorithm, KEY)
     chunk = jax.jit(lambda number: train_chunk(algorithm, KEY, 5, number, begun))
     for number in range(1, 6):
         state, metrics = jax.jit(lambda number=number: train_scan(algorithm, KEY, number, begun))()
         found, rows = chunk(number)
-        same(found, state)
+        jax.tree.map(close, found, state)
         for name, row in rows.items():
-            np.testing.assert_array_equal(row[:number], metrics[name])
+            close(row[:number], metrics[name])
             np.testing.assert_array_equal(row[number:], 0)
 
 
@@ -144,7 +155,7 @@ def trained(config, number, state=None):
 @pytest.mark.parametrize("algo", [("algo=td",), PPO, (*PPO, "algo.max_kl=1e-9")], ids=["td", "ppo", "stopped early"])
 def test_schedules_follow_the_updates_and_not_the_gradient_steps(algo):
     """As many as were taken, or were left out beyond max_kl: sigma is where it belongs after each update."""
-    config = compose([*SIZES, *algo, *SCHEDULED])
+    config = configured(*algo, *SCHEDULED)
     state = None
     for update in range(1, UPDATES + 1):
         state, metrics = trained(config, 1, state)
@@ -155,7 +166,7 @@ def test_schedules_follow_the_updates_and_not_the_gradient_steps(algo):
 
 def test_step_sizes_follow_the_updates_and_not_the_gradient_steps():
     """One step of Adam moves a parameter by the step size: with all but one of six steps left out, that of the first."""
-    config = compose([*SIZES, *PPO, "algo.max_kl=1e-9", "algo.final_lr=0", "algo.actor_lr=0.01"])
+    config = configured(*PPO, "algo.max_kl=1e-9", "algo.final_lr=0", "algo.actor_lr=0.01")
     algorithm = make_algorithm(config, make_env(config))
     begun = initial_state(algorithm, KEY)
 
@@ -172,7 +183,7 @@ def test_step_sizes_follow_the_updates_and_not_the_gradient_steps():
 
 def test_a_longer_run_goes_on_as_if_it_had_been_that_long():
     """After a resume with twice the steps: sigma and step sizes of that run, and never beyond their last values."""
-    short, long = (compose([*SIZES, *SCHEDULED, f"total_steps={STEPS * n}"]) for n in (UPDATES, 2 * UPDATES))
+    short, long = (configured(*SCHEDULED, f"total_steps={STEPS * n}") for n in (UPDATES, 2 * UPDATES))
     state, _ = trained(short, UPDATES + 3)
     np.testing.assert_allclose(sigma(state), 0.05, rtol=1e-5)
     for update in range(UPDATES + 4, 2 * UPDATES + 3):
@@ -182,7 +193,7 @@ def test_a_longer_run_goes_on_as_if_it_had_been_that_long():
 
 def test_what_jumps_on_resume_is_said():
     def said(before, after, update, *options):
-        configs = [compose([*SIZES, *options, f"total_steps={STEPS * n}"]) for n in (before, after)]
+        configs = [configured(*options, f"total_steps={STEPS * n}") for n in (before, after)]
         return described_jump(*configs, update)
 
     words = "from here on as in a run of 320 steps: step sizes are 55.0% of the first, not 10.0%"
@@ -197,7 +208,7 @@ def test_what_jumps_on_resume_is_said():
 
 def test_updates_that_are_left_out_hold_no_schedule_up(tmp_path, exploding_at):
     exploding_at(2, 3, UPDATES - 1)
-    config = compose([*SIZES, *SCHEDULED, "nan_policy=skip"])
+    config = configured(*SCHEDULED, "nan_policy=skip")
     compiled = compile_program(config, make_env(config), chunk=UPDATES)
     train_state, metrics = compiled.advance(compiled.init().train)
     assert (metrics["unsound"] > 0).sum() == 3
@@ -287,7 +298,7 @@ def test_agents_that_stood_still_end_with_the_others(tmp_path, monkeypatch):
 def _updates_of_agents(folder):
     from jaxpg.run.checkpoint import Checkpoints
 
-    config = compose([*SIZES, "num_seeds=2"])
+    config = configured("num_seeds=2")
     shape = program.state_shape(make_algorithm(config, make_env(config)), 2)
     checkpoints = Checkpoints(folder / "checkpoints", read_only=True)
     return np.asarray(checkpoints.restore(checkpoints.latest(), shape).train.update).tolist()

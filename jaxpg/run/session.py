@@ -23,6 +23,7 @@ from jaxpg.run.errors import UserError
 from jaxpg.run.folder import MetricsLog, RunFolder, jsonable
 from jaxpg.run.keeper import Keeper
 from jaxpg.run.loggers import follower
+from jaxpg.run.names import own_metrics
 from jaxpg.run.program import Program, Schedule, compile_program, described_jump, make_env, plan
 from jaxpg.run.runtime import prepare
 from jaxpg.run.schema import Run
@@ -302,7 +303,7 @@ def _evaluate(program: Program, state: RunState) -> tuple[RunState, dict[str, An
     policy = current_policy(state.train)
     episodes = jax.tree.map(np.asarray, program.evaluate(policy))
     returns = counted_returns(episodes.episode_return, episodes.diverged).mean(axis=-1)
-    found = {name: finite_mean(value) for name, value in episodes.metrics.items()}
+    found = {name: finite_mean(value) for name, value in own_metrics(episodes.metrics).items()}
     found |= {"return": returns, "diverged": episodes.diverged.sum(axis=-1)}
     best = better(state.best, Best(policy, returns.astype(np.float32)))
     return state._replace(best=best), {f"eval_{name}": jsonable(value) for name, value in found.items()}
