@@ -16,7 +16,7 @@ import numpy as np
 
 from jaxpg.run import agents, figures, folder, lock, memory, registered, results, same_run, versions
 from jaxpg.run import config as configuration
-from jaxpg.run.cache import compilation_cache, physics_cache
+from jaxpg.run.cache import compilation_cache, physics_cache, timed
 from jaxpg.run.chunks import PATIENCE, Watch, summary
 from jaxpg.run.config import Config
 from jaxpg.run.errors import UserError
@@ -166,14 +166,16 @@ def _env(config: Config) -> Any:
 
 def _compile(session: Session, env: Any, resumed: bool = False) -> tuple[Program, float]:
     """The compiled program, and the seconds that it took."""
-    session.display.say("compiling ...")
-    began = time.monotonic()
-    with compilation_cache(session.config.run.cache, session.display.say):
-        program = compile_program(
-            session.config, env, session.schedule.chunk, resumed=resumed, meanwhile=_import_the_rest
-        )
+    config, display, began = session.config, session.display, time.monotonic()
+    what = f"{config.choices['algo']} on {config.task}, network={config.choices['network']}"
+    with timed(config.run.cache, f"{what} {config.num_shards} {config.run.vmap_seeds} {resumed}") as before:
+        with display.working(f"compiling the updates and evaluations of {what} ({before})"):
+            with compilation_cache(config.run.cache, display.say):
+                program = compile_program(
+                    config, env, session.schedule.chunk, resumed=resumed, meanwhile=_import_the_rest
+                )
     seconds = time.monotonic() - began
-    session.display.say(f"compiled in {seconds:.1f} s")
+    display.say(f"compiled in {seconds:.1f} s")
     return program, seconds
 
 
