@@ -117,7 +117,7 @@ class StopAfter:
 
 
 def test_a_run_that_was_stopped_ends_where_one_ends_that_was_not(tmp_path, monkeypatch):
-    """With other intervals after it, too: the same updates, lines and bits, where the total is no multiple of a chunk."""
+    """To the bit, where the total is no multiple of a chunk; with other intervals the run ends at the same update."""
     arguments = [*SIZES, CHUNKS_OF_THREE]
     assert train.main([*arguments, f"run_dir={tmp_path / 'whole'}"]) == 0
     with monkeypatch.context() as patch:
@@ -165,7 +165,7 @@ def test_schedules_follow_the_updates_and_not_the_gradient_steps(algo):
 
 
 def test_step_sizes_follow_the_updates_and_not_the_gradient_steps():
-    """One step of Adam moves a parameter by the step size: with all but one of six steps left out, that of the first."""
+    """One step of Adam moves a parameter by the step size; all but one of six steps are left out here."""
     config = configured(*PPO, "algo.max_kl=1e-9", "algo.final_lr=0", "algo.actor_lr=0.01")
     algorithm = make_algorithm(config, make_env(config))
     begun = initial_state(algorithm, KEY)

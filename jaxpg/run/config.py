@@ -140,13 +140,13 @@ def _batches_that_cannot_teach(config: Config) -> Iterator[str]:
             )
         if algo.returns == "whole" and algo.normalize_advantages:
             yield (
-                "algo.returns=whole algo.normalize_advantages=true: the mean that is taken away is the return of the only "
-                "episode; num_envs must be at least 2, or algo.normalize_advantages=false"
+                "algo.returns=whole algo.normalize_advantages=true: the mean that is taken away is the return of the "
+                "only episode; num_envs must be at least 2, or algo.normalize_advantages=false"
             )
     if run.num_envs * run.num_steps == 1 and getattr(algo, "normalize_advantages", False):
         yield (
-            f"num_envs={run.num_envs} num_steps={run.num_steps}: the mean of a single advantage is that advantage, and 0 "
-            "is left of it; take more of either, or algo.normalize_advantages=false"
+            f"num_envs={run.num_envs} num_steps={run.num_steps}: less its mean a single advantage is 0; "
+            "take more of either, or algo.normalize_advantages=false"
         )
 
 

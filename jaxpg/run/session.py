@@ -168,12 +168,13 @@ def _compile(session: Session, env: Any, resumed: bool = False) -> tuple[Program
     """The compiled program, and the seconds that it took."""
     config, display, began = session.config, session.display, time.monotonic()
     what = f"{config.choices['algo']} on {config.task}, network={config.choices['network']}"
-    with timed(config.run.cache, f"{what} {config.num_shards} {config.run.vmap_seeds} {resumed}") as before:
-        with display.working(f"compiling the updates and evaluations of {what} ({before})"):
-            with compilation_cache(config.run.cache, display.say):
-                program = compile_program(
-                    config, env, session.schedule.chunk, resumed=resumed, meanwhile=_import_the_rest
-                )
+    name = f"{what} {config.num_shards} {config.run.vmap_seeds} {resumed}"
+    with (
+        timed(config.run.cache, name) as before,
+        display.working(f"compiling the updates and evaluations of {what} ({before})"),
+        compilation_cache(config.run.cache, display.say),
+    ):
+        program = compile_program(config, env, session.schedule.chunk, resumed=resumed, meanwhile=_import_the_rest)
     seconds = time.monotonic() - began
     display.say(f"compiled in {seconds:.1f} s")
     return program, seconds
