@@ -1,5 +1,6 @@
 """Where a run ends: after the updates that were asked for, however it was cut, and whatever was not finite."""
 
+import itertools
 import json
 from signal import SIGTERM
 
@@ -58,7 +59,7 @@ def test_lines_come_at_the_same_updates_wherever_a_run_goes_on(log_interval):
         assert update + schedule.until_next_line(update) == min(end for end in ends if end > update)
 
 
-@pytest.mark.parametrize("agents", [(), ("num_seeds=2", "vmap_seeds=2"), ("num_seeds=2",)])
+@pytest.mark.parametrize("agents", [(), ("num_seeds=2", "vmap_seeds=2"), ("num_envs=4", "algo.num_shards=2")])
 def test_one_program_makes_parts_of_any_length(agents):
     """To the bit the training in one piece; and only as many rows of metrics as updates."""
     config = configured(*agents)
@@ -89,7 +90,7 @@ def test_a_chunk_is_the_scan_of_its_updates():
     algorithm = make_algorithm(config, make_env(config))
     begun = initial_state(algorithm, KEY)
     chunk = jax.jit(lambda number: train_chunk(algorithm, KEY, 5, number, begun))
-    for number in range(1, 6):
+    for number in (1, 4, 5):
         state, metrics = jax.jit(lambda number=number: train_scan(algorithm, KEY, number, begun))()
         found, rows = chunk(number)
         jax.tree.map(close, found, state)
@@ -147,18 +148,22 @@ def expected_sigma(update, num_updates):
     return 0.8 * (0.05 / 0.8) ** min(update / num_updates, 1)
 
 
-def trained(config, number, state=None):
+def one_by_one(config, state=None):
+    """The state after each further update, and its metrics, for ever."""
     algorithm = make_algorithm(config, make_env(config))
-    return jax.jit(lambda state: train_scan(algorithm, KEY, number, state))(state or initial_state(algorithm, KEY))
+    update = jax.jit(lambda state: train_scan(algorithm, KEY, 1, state))
+    state = state or initial_state(algorithm, KEY)
+    while True:
+        state, metrics = update(state)
+        yield state, metrics
 
 
 @pytest.mark.parametrize("algo", [("algo=td",), PPO, (*PPO, "algo.max_kl=1e-9")], ids=["td", "ppo", "stopped early"])
 def test_schedules_follow_the_updates_and_not_the_gradient_steps(algo):
     """As many as were taken, or were left out beyond max_kl: sigma is where it belongs after each update."""
-    config = configured(*algo, *SCHEDULED)
-    state = None
+    updates = one_by_one(configured(*algo, *SCHEDULED))
     for update in range(1, UPDATES + 1):
-        state, metrics = trained(config, 1, state)
+        state, metrics = next(updates)
         np.testing.assert_allclose(sigma(state), expected_sigma(update, UPDATES), rtol=1e-5)
     if "algo.max_kl=1e-9" in algo:
         assert metrics["gradient_steps"][0] == 1
@@ -170,8 +175,10 @@ def test_step_sizes_follow_the_updates_and_not_the_gradient_steps():
     algorithm = make_algorithm(config, make_env(config))
     begun = initial_state(algorithm, KEY)
 
+    step = jax.jit(algorithm.step)
+
     def moved(update):
-        state, _ = jax.jit(algorithm.step)(begun._replace(update=jnp.int32(update)), KEY)
+        state, _ = step(begun._replace(update=jnp.int32(update)), KEY)
         steps = jax.tree.map(lambda a, b: float(jnp.abs(a - b).max()), state.params["actor"], begun.params["actor"])
         return max(jax.tree.leaves(steps))
 
@@ -184,10 +191,11 @@ def test_step_sizes_follow_the_updates_and_not_the_gradient_steps():
 def test_a_longer_run_goes_on_as_if_it_had_been_that_long():
     """After a resume with twice the steps: sigma and step sizes of that run, and never beyond their last values."""
     short, long = (configured(*SCHEDULED, f"total_steps={STEPS * n}") for n in (UPDATES, 2 * UPDATES))
-    state, _ = trained(short, UPDATES + 3)
+    state, _ = next(itertools.islice(one_by_one(short), UPDATES + 2, None))
     np.testing.assert_allclose(sigma(state), 0.05, rtol=1e-5)
+    updates = one_by_one(long, state)
     for update in range(UPDATES + 4, 2 * UPDATES + 3):
-        state, _ = trained(long, 1, state)
+        state, _ = next(updates)
         np.testing.assert_allclose(sigma(state), expected_sigma(update, 2 * UPDATES), rtol=1e-5)
 
 
