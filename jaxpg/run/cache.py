@@ -9,7 +9,7 @@ The store is `jaxpg` in the user's cache folder (XDG_CACHE_HOME, else ~/.cache),
 XLA_FLAGS and number of threads: jax's own keys leave out the last one, and trust the CPU to be the same.
 
 The equations of the environments' physics (`envs.physics.storage`) are kept beside them, in `physics`. They are text,
-and the same on every machine.
+and the same on every machine. In `times` it is kept how long compilations have taken.
 """
 
 from __future__ import annotations
@@ -18,14 +18,12 @@ import contextlib
 import hashlib
 import os
 import platform
-import re
 import shutil
 import stat
 import tempfile
-import threading
 import time
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 
 import jax
@@ -33,6 +31,7 @@ import jaxlib
 from jax.experimental.compilation_cache import compilation_cache as jax_cache
 
 from envs.physics import storage
+from jaxpg.run.stderr import filtered
 from jaxpg.run.versions import num_threads
 
 MAX_AGE = 30 * 24 * 3600.0  # seconds; an older entry is removed, and compiled anew when it is needed
@@ -40,12 +39,9 @@ MAX_BYTES = 64 * 2**20  # of all entries together: every start reads those of it
 MAX_STAGING_AGE = 24 * 3600.0  # of the temporary folder of a process that was killed
 STAGING = "staging-"
 PHYSICS = "physics"
+TIMES = "times"
 REJECTED = "rejected"  # a file where the entries belong, on a machine that cannot load what it has compiled
 UNREADABLE = "Error reading persistent compilation cache entry"
-# XLA's words, on standard error, for a program that it takes for another machine's; some CPUs never know their own.
-OTHER_MACHINE = b"Machine type used for XLA:CPU compilation"
-# The same of what is no capability but a choice between instructions, which it makes on every CPU with AVX-512.
-PREFERENCE = re.compile(rb"feature \+?prefer-")
 
 
 class CacheError(Exception):
@@ -64,25 +60,27 @@ def compilation_cache(enabled: bool, say: Callable[[str], None]) -> Iterator[Non
       say: takes the line, if there is something to say.
     """
     if not enabled or jax.config.jax_compilation_cache_dir is not None:
-        yield
+        with filtered():
+            yield
         return
     try:
         store = Store(cache_folder())
         staging = store.stage()
     except (CacheError, OSError) as error:
         say(f"note: no compilation cache: {error}")
-        yield
+        with filtered():
+            yield
         return
     with staging:
         yield from _compile_in(store, Path(staging.name), say)
 
 
 def _compile_in(store: Store, staging: Path, say: Callable[[str], None]) -> Iterator[None]:
-    with warnings.catch_warnings(record=True) as caught, _without_other_machine() as refusals:
+    with warnings.catch_warnings(record=True) as caught, filtered() as seen:
         warnings.simplefilter("always")
         with _jax_cache_in(staging):
             yield
-    rejected = bool(refusals)
+    rejected = seen.refused
     for warning in caught:
         if str(warning.message).startswith(UNREADABLE):
             rejected = True
@@ -135,15 +133,52 @@ def physics_cache(enabled: bool) -> Iterator[None]:
         yield
 
 
+@contextlib.contextmanager
+def timed(enabled: bool, what: str) -> Iterator[str]:
+    """Keeps how long what is done inside takes, by its name; yields how long it has taken so far, in words.
+
+    Args:
+      enabled: without it nothing is read or written.
+      what: its name; of each machine, by `machine()`, there are times of its own.
+    """
+    texts = None
+    if enabled:
+        with contextlib.suppress(CacheError, OSError):
+            texts = Texts(cache_folder(), TIMES)
+    name = _digest(f"{machine()} {what}".encode())
+    known = texts.read(name) if texts else None
+    times = [float(x) for x in known.split()] if known else []
+    began = time.monotonic()
+    yield _in_words(times)
+    if texts:
+        times.append(time.monotonic() - began)
+        texts.write(name, f"{min(times):.1f} {max(times):.1f}")
+
+
+def _in_words(times: Sequence[float]) -> str:
+    """
+    >>> _in_words([]), _in_words([2.04, 15.3]), _in_words([15.3, 15.3])
+    ('for the first time here', '2.0 to 15.3 s here before', '15.3 s here before')
+    """
+    if not times:
+        return "for the first time here"
+    low, high = (f"{x:.1f}" for x in (min(times), max(times)))
+    return f"{high} s here before" if low == high else f"{low} to {high} s here before"
+
+
 class Texts:
     """Texts by name, each in a file with its digest in its name; a damaged one is as if it were not there.
+
+    Args:
+      root: the cache folder.
+      kind: the folder in it.
 
     Raises:
       CacheError: the folder is not the user's alone; OSError: there can be none.
     """
 
-    def __init__(self, root: Path):
-        self.folder = root / PHYSICS
+    def __init__(self, root: Path, kind: str = PHYSICS):
+        self.folder = root / kind
         _make_private(root, self.folder)
 
     def read(self, name: str) -> str | None:
@@ -273,7 +308,7 @@ def check_private(folder: Path) -> None:
 def remove_old(root: Path, now: float | None = None) -> None:
     """Keeps the newest entries of all machines, up to `MAX_AGE` and `MAX_BYTES`; removes left temporary folders."""
     now, total = now or time.time(), 0
-    files = [path for kind in ("jaxlib-*", PHYSICS) for path in root.glob(f"{kind}/*")]
+    files = [path for kind in ("jaxlib-*", PHYSICS, TIMES) for path in root.glob(f"{kind}/*")]
     for age, path in sorted((_age(path, now), path) for path in files):
         total += path.lstat().st_size
         if total > MAX_BYTES or age > MAX_AGE:
@@ -297,32 +332,3 @@ def _entries(folder: Path) -> list[Path]:
 
 def _digest(content: bytes) -> str:
     return hashlib.blake2b(content, digest_size=16).hexdigest()
-
-
-@contextlib.contextmanager
-def _without_other_machine() -> Iterator[list[bytes]]:
-    """Standard error without XLA's lines about another machine, of which refusals are kept.
-
-    They are written by C++, so the file descriptor itself is led through a pipe.
-    """
-    refusals: list[bytes] = []
-    before, (reader, writer) = os.dup(2), os.pipe()
-    os.dup2(writer, 2)
-    os.close(writer)
-    thread = threading.Thread(target=_filter, args=(reader, before, refusals))
-    thread.start()
-    try:
-        yield refusals
-    finally:
-        os.dup2(before, 2)  # closes the pipe's last writing end: the thread ends
-        thread.join()
-        os.close(before)
-
-
-def _filter(reader: int, writer: int, refusals: list[bytes]) -> None:
-    with os.fdopen(reader, "rb") as lines:
-        for line in lines:
-            if OTHER_MACHINE not in line:
-                os.write(writer, line)
-            elif not PREFERENCE.search(line):
-                refusals.append(line)

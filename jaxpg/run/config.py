@@ -26,6 +26,7 @@ from jaxpg.run.schema import GROUPS, LARGEST, Gaussian, Run, option_fields
 DEFAULT_CHOICES = {"env": "pendulum", "algo": "td", "network": "mlp"}  # algo: the first that the environment has tuned
 FOLDERS = ("run_dir", "resume", "run", "out")  # options whose value is a path
 DEFAULT_ROLLOUT = 16  # steps of a TD rollout where neither the user nor the environment says
+OF_OTHER_EPISODES = ("mean", "time_mean", "optimal", "leave_one_out")  # baselines that are means over episodes
 LIBRARIES = ("brax", "playground")  # whose environments have names of their own, as the option `name`
 
 
@@ -104,7 +105,10 @@ def _complete(config: Config) -> Config:
     problems = [*_conflicts_of_the_algorithm(config), *_conflicts_of_the_network(config), *_conflicts_of_agents(config)]
     default = config.env.episode_length if config.choices["algo"] == "reinforce" else DEFAULT_ROLLOUT
     config = dataclasses.replace(config, run=dataclasses.replace(config.run, num_steps=config.run.num_steps or default))
-    problems += _conflicts_of_sizes(config.run, config.algo, config.env.episode_length)
+    problems += [
+        *_conflicts_of_sizes(config.run, config.algo, config.env.episode_length),
+        *_batches_that_cannot_teach(config),
+    ]
     if problems:
         raise OptionError(problems)
     return config
@@ -115,8 +119,6 @@ def _conflicts_of_the_algorithm(config: Config) -> Iterator[str]:
     if config.choices["algo"] == "reinforce":
         if run.num_steps not in (None, horizon):
             yield f"num_steps={run.num_steps}: algo=reinforce plays whole episodes, {horizon} steps here; leave it out"
-        if algo.baseline == "leave_one_out" and run.num_envs < 2:
-            yield "algo.baseline=leave_one_out needs other episodes: num_envs must be at least 2"
         if algo.discounted and algo.returns == "whole":
             yield "algo.discounted=true: whole returns have the factors gamma^t in them; leave it out"
     shards = config.num_shards
@@ -125,6 +127,27 @@ def _conflicts_of_the_algorithm(config: Config) -> Iterator[str]:
     elif config.choices["algo"] == "ppo" and run.num_envs // shards % algo.minibatches:
         whole = f"num_envs={run.num_envs}" + (f" / algo.num_shards={shards}" if shards > 1 else "")
         yield _does_not_divide("algo.minibatches", algo.minibatches, whole, run.num_envs // shards)
+
+
+def _batches_that_cannot_teach(config: Config) -> Iterator[str]:
+    """Batches of which nothing is left once their own mean is taken away: the policy would stay what it is for ever."""
+    algo, run = config.algo, config.run
+    if config.choices["algo"] == "reinforce" and run.num_envs < 2:
+        if algo.baseline in OF_OTHER_EPISODES:
+            yield (
+                f"algo.baseline={algo.baseline} needs other episodes, with a single one it is that one's own return: "
+                "num_envs must be at least 2; algo.baseline=none and value do without"
+            )
+        if algo.returns == "whole" and algo.normalize_advantages:
+            yield (
+                "algo.returns=whole algo.normalize_advantages=true: the mean that is taken away is the return of the "
+                "only episode; num_envs must be at least 2, or algo.normalize_advantages=false"
+            )
+    if run.num_envs * run.num_steps == 1 and getattr(algo, "normalize_advantages", False):
+        yield (
+            f"num_envs={run.num_envs} num_steps={run.num_steps}: less its mean a single advantage is 0; "
+            "take more of either, or algo.normalize_advantages=false"
+        )
 
 
 def _does_not_divide(name: str, value: int, whole: str, number: int) -> str:

@@ -12,6 +12,7 @@ import envs
 from envs.hints import pip_install
 from jaxpg.evaluation import evaluate
 from jaxpg.run.errors import UserError
+from jaxpg.run.names import own_metrics
 from jaxpg.run.policies import StoredPolicy
 from jaxpg.run.statistics import counted_returns
 
@@ -22,7 +23,7 @@ class Results(NamedTuple):
     Attributes:
       returns: at what they count (`counted_returns`), `[N]`.
       diverged: whether the physics did, `[N]` of bool.
-      metrics: the environment's, of the last step, `[N]` by name.
+      metrics: the environment's, of the last step, `[N]` by their names among ours (`own_metrics`).
     """
 
     returns: np.ndarray
@@ -40,7 +41,7 @@ def play_own(stored: StoredPolicy, num_episodes: int, seed: int) -> Results:
 
     episodes = jax.tree.map(np.asarray, play(stored.policy, jax.random.key(seed)))
     returns = counted_returns(episodes.episode_return, episodes.diverged)
-    return Results(returns, episodes.diverged, episodes.metrics)
+    return Results(returns, episodes.diverged, own_metrics(episodes.metrics))
 
 
 def play_gymnasium(stored: StoredPolicy, num_episodes: int, seed: int) -> Results:

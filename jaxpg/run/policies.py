@@ -17,6 +17,7 @@ from jaxpg.run.agents import alone, described_agent
 from jaxpg.run.checkpoint import Checkpoints
 from jaxpg.run.config import Config
 from jaxpg.run.errors import UserError
+from jaxpg.run.names import own_interface
 from jaxpg.run.program import RUN_ONCE, initial_run, make_algorithm, make_env, make_networks, state_shape
 from jaxpg.run.runtime import prepare
 from jaxpg.run.state import Policy, current_policy
@@ -30,7 +31,8 @@ class StoredPolicy(NamedTuple):
       value: `value(policy, obs) -> V`, what the critic expects of the discounted rewards to come, in their units.
       policy: its parameters; an argument of `act`, so that all policies of a kind are one compiled program.
       env: the environment, with the changes asked for.
-      interface: what its numbers are; kept, as brax's environments trace a reset to know how many they have.
+      interface: what its numbers are, each with a name of its own; kept, as brax's environments trace a reset to know
+        how many they have.
       config: of the agent as a run of its own, with the changes.
       agent: in words, such as "seed 3".
       update: updates made when the checkpoint was written.
@@ -117,7 +119,7 @@ def stored_policy(config: Config, env: Any, policy: Policy, update: int, agent: 
     def value(policy, obs):
         return networks.value(policy.params["critic"], normalization.normalize(policy.normalizer, obs)) / reward_scale
 
-    return StoredPolicy(act, value, policy, env, interface(env), config, agent, update)
+    return StoredPolicy(act, value, policy, env, own_interface(interface(env)), config, agent, update)
 
 
 def untrained(stored: StoredPolicy) -> StoredPolicy:

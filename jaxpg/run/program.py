@@ -246,7 +246,7 @@ def log_sigma(config: Config) -> optax.Schedule:
 def with_sigma(algorithm: Algorithm, log_sigma: optax.Schedule) -> Algorithm:
     """The algorithm whose policy has log sigma = `log_sigma(n)` after n updates, whatever its gradients and its past.
 
-    Not a thing that the optimizer does: steps that it does not take, and updates that are left out, hold no schedule up.
+    The optimizer does not do it: steps that it does not take, and updates that are left out, would hold it up.
     """
 
     def settled(state: TrainState) -> TrainState:
@@ -388,7 +388,8 @@ def over_agents(fn: Callable, number: int) -> Callable:
 def in_groups(compiled: Compiled, size: int, at_once: int) -> Callable:
     """What was compiled for `size` agents, for any multiple of as many: `[S, ...]` to `[S, ...]`.
 
-    Arguments by name are the same for all agents. One group is handed through as it is; several come back as numpy arrays.
+    Arguments by name are the same for all agents. One group is handed through as it is; several come back as numpy
+    arrays.
 
     Args:
       compiled: takes and gives trees whose leaves begin with the agents' axis.

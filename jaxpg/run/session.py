@@ -18,13 +18,14 @@ from envs.base import interface
 from jaxpg.divergence import BOUND
 from jaxpg.run import agents, figures, folder, lock, memory, registered, results, same_run, versions
 from jaxpg.run import config as configuration
-from jaxpg.run.cache import compilation_cache, physics_cache
+from jaxpg.run.cache import compilation_cache, physics_cache, timed
 from jaxpg.run.chunks import PATIENCE, Watch, summary
 from jaxpg.run.config import Config
 from jaxpg.run.errors import UserError
 from jaxpg.run.folder import MetricsLog, RunFolder, jsonable
 from jaxpg.run.keeper import Keeper
 from jaxpg.run.loggers import follower
+from jaxpg.run.names import own_metrics
 from jaxpg.run.program import Program, Schedule, compile_program, described_jump, make_env, plan
 from jaxpg.run.runtime import prepare
 from jaxpg.run.schema import Run
@@ -183,14 +184,17 @@ def _env(config: Config) -> Any:
 
 def _compile(session: Session, env: Any, resumed: bool = False) -> tuple[Program, float]:
     """The compiled program, and the seconds that it took."""
-    session.display.say("compiling ...")
-    began = time.monotonic()
-    with compilation_cache(session.config.run.cache, session.display.say):
-        program = compile_program(
-            session.config, env, session.schedule.chunk, resumed=resumed, meanwhile=_import_the_rest
-        )
+    config, display, began = session.config, session.display, time.monotonic()
+    what = f"{config.choices['algo']} on {config.task}, network={config.choices['network']}"
+    name = f"{what} {config.num_shards} {config.run.vmap_seeds} {resumed}"
+    with (
+        timed(config.run.cache, name) as before,
+        display.working(f"compiling the updates and evaluations of {what} ({before})"),
+        compilation_cache(config.run.cache, display.say),
+    ):
+        program = compile_program(config, env, session.schedule.chunk, resumed=resumed, meanwhile=_import_the_rest)
     seconds = time.monotonic() - began
-    session.display.say(f"compiled in {seconds:.1f} s")
+    display.say(f"compiled in {seconds:.1f} s")
     return program, seconds
 
 
@@ -320,7 +324,7 @@ def _evaluate(program: Program, state: RunState) -> tuple[RunState, dict[str, An
     policy = current_policy(state.train)
     episodes = jax.tree.map(np.asarray, program.evaluate(policy))
     returns = counted_returns(episodes.episode_return, episodes.diverged).mean(axis=-1)
-    found = {name: finite_mean(value) for name, value in episodes.metrics.items()}
+    found = {name: finite_mean(value) for name, value in own_metrics(episodes.metrics).items()}
     found |= {"return": returns, "diverged": episodes.diverged.sum(axis=-1)}
     best = better(state.best, Best(policy, returns.astype(np.float32)))
     return state._replace(best=best), {f"eval_{name}": jsonable(value) for name, value in found.items()}

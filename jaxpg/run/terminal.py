@@ -3,10 +3,20 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import Any
 
 from rich.console import Console
-from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeRemainingColumn
+from rich.progress import (
+    BarColumn,
+    Progress,
+    SpinnerColumn,
+    TaskProgressColumn,
+    TextColumn,
+    TimeElapsedColumn,
+    TimeRemainingColumn,
+)
 
 
 class Display:
@@ -25,6 +35,18 @@ class Display:
     def say(self, text: str) -> None:
         self.console.print(text, markup=False)
 
+    @contextmanager
+    def working(self, text: str) -> Iterator[None]:
+        """Says what is being done inside: with a clock that runs on a terminal, in a line elsewhere."""
+        if not self.console.is_terminal:
+            self.say(f"{text} ...")
+            yield
+            return
+        columns = (SpinnerColumn(), TextColumn("{task.description}", markup=False), TimeElapsedColumn())
+        with Progress(*columns, console=self.console, transient=True) as clock:
+            clock.add_task(text, total=None)
+            yield
+
     def start(self) -> None:
         """Training begins now."""
         self._began = time.monotonic()
@@ -32,13 +54,13 @@ class Display:
             self._bar.start()
 
     def update(self, line: dict[str, Any]) -> None:
-        """Shows a line of metrics: every one on the bar, those with an evaluation as plain text."""
+        """Shows a line of metrics: on a terminal each on the bar, and those with an evaluation as text that stays."""
         seconds = time.monotonic() - self._began
         rate = (line["steps"] - self._first_steps) / max(seconds, 1e-9)
         text = f"{rate:,.0f} steps/s  return {shown(line.get('return'))}"
         if self._bar:
             self._bar.update(self._task, completed=line["steps"], description=text)
-        elif "eval_return" in line:
+        if "eval_return" in line:
             left = (self._total - line["steps"]) / rate
             self.say(
                 f"{line['steps'] / self._total:4.0%}  {line['steps']:>12,} steps  {text}  "
