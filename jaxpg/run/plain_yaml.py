@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-from pathlib import Path
 from typing import Any
 
 import yaml
@@ -35,6 +34,6 @@ def dump(values: dict[str, Any]) -> str:
     return yaml.dump(values, Dumper=Dumper, default_flow_style=False, allow_unicode=True, sort_keys=False)
 
 
-def load(path: Path) -> Any:
-    """What is in a file; raises OSError, UnicodeError or yaml.YAMLError where it cannot be read."""
-    return yaml.load(path.read_text(encoding="utf-8"), Loader)
+def load(text: str) -> Any:
+    """What the text says; raises yaml.YAMLError where it is no YAML."""
+    return yaml.load(text, Loader)
