@@ -120,5 +120,5 @@ class MjxEnv:
 
 def initial_state(pipeline_state: Any, obs: jax.Array, metric_names: tuple[str, ...] = ()) -> State:
     """The State after a reset: nothing earned, nothing ended, all metrics 0."""
-    zero = jnp.zeros((), obs.dtype)
+    zero = jnp.zeros((), getattr(obs, "dtype", float))  # what is no array is refused by its own name, not here
     return State(pipeline_state, obs, reward=zero, done=zero, metrics=dict.fromkeys(metric_names, zero))

@@ -5,11 +5,22 @@ from __future__ import annotations
 import dataclasses
 import math
 
+import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from envs.options import OptionError, build, convert, describe, describe_range, option, unknown
+from envs.options import (
+    OptionError,
+    build,
+    convert,
+    declaration_problems,
+    describe,
+    describe_range,
+    nearest,
+    option,
+    unknown,
+)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -230,3 +241,84 @@ def test_help_is_followed_by_the_range_if_there_is_one():
     assert texts["number"] == "how many (at least 1, at most 10)"
     assert texts["kind"] == "which (plain or squashed)"
     assert texts["anything"] == "any number"
+
+
+@pytest.mark.parametrize(
+    ("name", "near"),
+    [
+        ("algo.lr", "algo.actor_lr"),
+        ("lr", "algo.actor_lr"),
+        ("gamma", "algo.gamma"),
+        ("gama", "algo.gamma"),
+        ("algo.gama", "algo.gamma"),
+        ("network.gamma", "algo.gamma"),
+        ("alog.gama", "algo.gamma"),
+        ("env.seeed", None),
+        ("seeed", "seed"),
+        ("qqq", None),
+        ("algo.qqq", None),
+    ],
+)
+def test_what_is_before_the_dot_says_nothing_of_how_near_a_name_is(name, near):
+    known = ["algo.actor_lr", "algo.critic_lr", "algo.gamma", "algo.n", "env.mass", "network.widths", "seed"]
+    assert nearest(name, known) == near
+
+
+def test_known_names_of_a_group_are_listed_where_none_is_near():
+    known = ["algo.gamma", "algo.n", *(f"network.width_{i}" for i in range(30))]
+    assert unknown("option", "algo.qqq", known) == "unknown option 'algo.qqq': known are algo.gamma, algo.n"
+
+
+@pytest.mark.parametrize("kind", [np.int64, np.uint8, np.float32, np.float64])
+def test_numbers_of_numpy_are_numbers(kind):
+    assert type(convert(int, kind(3))) is int
+    assert type(convert(float, kind(3))) is float
+
+
+@given(st.integers(-1000, 1000) | st.floats(-1e3, 1e3) | st.none() | st.text(max_size=3) | st.booleans())
+@settings(max_examples=100, deadline=None)
+def test_of_several_types_a_value_is_of_the_first_that_it_fits(value):
+    fits = next((kind for kind in (int, float, str, type(None)) if _fits(kind, value)), None)
+    if fits is None:
+        with pytest.raises(ValueError, match=r"^expected a whole number or a number or a name$"):
+            convert(int | float | str | None, value)
+    else:
+        found = convert(int | float | str | None, value)
+        assert (type(found), found) == (fits, value)
+
+
+def _fits(kind, value):
+    try:
+        convert(kind, value)
+    except ValueError:
+        return False
+    return True
+
+
+@given(st.lists(st.integers(-5, 5), max_size=4))
+@settings(max_examples=50, deadline=None)
+def test_tuples_have_as_many_elements_as_their_type_says(values):
+    assert convert(tuple[int, ...], values) == tuple(values)
+    if len(values) == 2:
+        assert convert(tuple[int, float], values) == (values[0], float(values[1]))
+    else:
+        with pytest.raises(ValueError, match=r"^expected a list of 2 values$"):
+            convert(tuple[int, float], values)
+
+
+def test_a_field_without_option_has_neither_help_nor_range():
+    plain = dataclasses.make_dataclass("Plain", [("force", float, 5.0)])
+    (field,) = dataclasses.fields(plain)
+    assert describe(field) == ""
+    assert build(plain, {"force": -1e9}) == plain(-1e9)
+
+
+def test_options_are_declared_without_problems():
+    assert list(declaration_problems(Options)) == []
+
+
+@pytest.mark.parametrize("default", [-1.0, "much", None])
+def test_a_default_that_the_option_cannot_have_is_a_problem(default):
+    kind = dataclasses.make_dataclass("Kind", [("mass", float, option(default, "of the link", above=0))])
+    (problem,) = declaration_problems(kind)
+    assert problem.startswith(f"option 'mass': its default {default!r}: ")

@@ -18,7 +18,7 @@ from typing import Any
 
 import envs
 from envs.options import OptionError, build, unknown
-from jaxpg.run import plain_yaml, registered
+from jaxpg.run import files, plain_yaml, registered
 from jaxpg.run import sweep as sweeping
 from jaxpg.run.errors import UserError
 from jaxpg.run.schema import GROUPS, LARGEST, Gaussian, Run, option_fields
@@ -345,7 +345,7 @@ def load(path: Path) -> Config:
       UserError: the file cannot be read; OptionError: a name, type or range in it is wrong.
     """
     try:
-        values = plain_yaml.load(path)
+        values = plain_yaml.load(files.read(path).decode())
         registered.check_known(values["env"]["id"], values.pop(registered.PROGRAM, None))
         return from_dict(values)
     except (OptionError, UserError):

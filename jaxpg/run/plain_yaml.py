@@ -3,12 +3,9 @@
 from __future__ import annotations
 
 import re
-from pathlib import Path
 from typing import Any
 
 import yaml
-
-from jaxpg.run import files
 
 FLOAT = re.compile(r"[-+]?[0-9][0-9_]*(\.[0-9_]*)?[eE][-+]?[0-9]+$")
 
@@ -37,6 +34,6 @@ def dump(values: dict[str, Any]) -> str:
     return yaml.dump(values, Dumper=Dumper, default_flow_style=False, allow_unicode=True, sort_keys=False)
 
 
-def load(path: Path) -> Any:
-    """What is in a file; raises OSError where it cannot be read or is a link, UnicodeError, or yaml.YAMLError."""
-    return yaml.load(files.read(path).decode(), Loader)
+def load(text: str) -> Any:
+    """What the text says; raises yaml.YAMLError where it is no YAML."""
+    return yaml.load(text, Loader)
