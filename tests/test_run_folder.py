@@ -13,7 +13,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from in_process import contents, ended
-from processes import RUN, outcome, proceed, stop_after, training, tree
+from processes import RUN, bound_by_permissions, outcome, proceed, stop_after, training, tree
 
 from jaxpg import compare, evaluate, export, inspect, report, train
 from jaxpg.run import cache, files, folder, lines, lock, versions

@@ -186,8 +186,8 @@ def _train(session: Session, program: Program, state: RunState, compile_seconds:
     config, schedule, run_folder, display = session
     solved = False
     first = update = _update(state.train)
+    keeper = Keeper(config, run_folder, display.say)  # before the log, which has files and processes to close
     log = MetricsLog(run_folder, update, display.say, config.run.loggers)
-    keeper = Keeper(config, run_folder, log, display.say)
     watch, watchdog = Watch(config, display.say, min(PATIENCE, schedule.num_updates)), Watchdog()
     began, seconds_before = time.monotonic(), log.seconds
     display.start()
@@ -212,9 +212,9 @@ def _train(session: Session, program: Program, state: RunState, compile_seconds:
                 log.write(line)
                 display.update(line)
                 if schedule.is_due(update, schedule.checkpoint_every) or keeper.failed:
-                    keeper.save(update, state)
+                    keeper.save(update, state, log)
             if update > first and keeper.saved != update:
-                keeper.save(update, state)
+                keeper.save(update, state, log)
     finally:
         display.stop()
         training_seconds = time.monotonic() - began
