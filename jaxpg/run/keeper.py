@@ -5,7 +5,8 @@ from __future__ import annotations
 from collections.abc import Callable
 
 from jaxpg.run.config import Config
-from jaxpg.run.folder import MetricsLog, RunFolder
+from jaxpg.run.folder import RunFolder
+from jaxpg.run.metrics_log import MetricsLog
 from jaxpg.run.state import RunState
 
 
