@@ -125,7 +125,8 @@ class Stopwatch:
 def measured(report: str, began: float, arguments: list[str]) -> int:
     """The training command with its phases timed."""
     watch = Stopwatch(began)
-    from jaxpg.run import folder, session
+    from jaxpg.run import session
+    from jaxpg.run.metrics_log import MetricsLog
     from jaxpg.train import main as train
 
     watch.add("imports", [0.0, 0.0])
@@ -134,14 +135,14 @@ def measured(report: str, began: float, arguments: list[str]) -> int:
         for name in names:
             owner, _, leaf = name.rpartition(".")
             watch.watch(getattr(session, owner) if owner else session, leaf, phase)
-    written = folder.MetricsLog.write
+    written = MetricsLog.write
 
     def first(log, line):
         if "from the command to the first line of metrics" not in watch.phases:
             watch.add("from the command to the first line of metrics", [0.0, 0.0])
         written(log, line)
 
-    folder.MetricsLog.write = first
+    MetricsLog.write = first
     watch.watch(session, "_train", "updates and all else")
     status = train(arguments)
     for phase in ("evaluations", "checkpoints", "figure"):

@@ -3,6 +3,7 @@
 import contextlib
 import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -19,9 +20,9 @@ RUN = (*SIZES, "eval_episodes=2", "env.episode_length=8", "checkpoint_interval=1
 
 
 @contextlib.contextmanager
-def training(environment, *arguments):
-    """A training process; its output comes line by line, without a buffer."""
-    command = [sys.executable, "-m", "jaxpg.train", *arguments]
+def training(environment, *arguments, by=()):
+    """A training process, started by the command `by`; its output comes line by line, without a buffer."""
+    command = [*by, sys.executable, "-m", "jaxpg.train", *arguments]
     environment = environment | {"PYTHONUNBUFFERED": "1"}
     pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.STDOUT, "text": True}
     with subprocess.Popen(command, env=environment, **pipes) as process:
@@ -74,6 +75,15 @@ def outcome(folder, which="checkpoints"):
 def tree(folder):
     """All files below a folder with their contents."""
     return {path.relative_to(folder): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+
+
+def bound_by_permissions():
+    """A command that starts another one, as root without root's right to read and write everything."""
+    if os.geteuid():
+        return []
+    if not shutil.which("setpriv"):
+        pytest.skip("permissions do not keep root from writing")
+    return ["setpriv", "--bounding-set=-dac_override,-dac_read_search"]
 
 
 @contextlib.contextmanager

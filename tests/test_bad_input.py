@@ -197,7 +197,7 @@ def finished(command, tmp_path_factory):
 
 RUN_MISTAKES = {
     "folder in use": (train, ["run_dir={run}"], "is not empty: take another run_dir, or resume="),
-    "folder named like a pattern": (train, ["run_dir={run}/[x]"], "a folder with [ or ] in its name"),
+    "folder whose name has two lines": (train, ["run_dir={run}/a\nb"], "expected letters that can be printed"),
     "folder with too long a name": (
         train,
         ["run_dir={run}/" + 300 * "x"],
@@ -279,7 +279,10 @@ def other_versions(folder):
 DAMAGES = {
     "bit flipped in the arrays": (flip_a_bit, "damaged|cannot be read"),
     "checkpoints removed": (lambda folder: shutil.rmtree(folder / "checkpoints"), "no checkpoint yet"),
-    "other network in config.yaml": (edit_config("- 32\n  - 32", "- 32\n  - 64"), "made by another program"),
+    "other network in config.yaml": (
+        edit_config("- 32\n  - 32", "- 32\n  - 64"),
+        "made with network.widths=[32, 32], but",
+    ),
     "other environment in config.yaml": (edit_config("id: pendulum", "id: arm"), "unknown option"),
     "config.yaml that is no YAML": (edit_config("env:", "env: ["), "not a configuration of a run"),
     "versions.json torn": (other_versions, "cannot be read"),

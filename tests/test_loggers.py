@@ -15,8 +15,9 @@ import pytest
 from jaxpg import train
 from jaxpg.run import folder
 from jaxpg.run.errors import UserError
-from jaxpg.run.folder import MetricsLog, RunFolder
+from jaxpg.run.folder import RunFolder
 from jaxpg.run.loggers import LoggerError, UntilItFails, follower, sender, values_of
+from jaxpg.run.metrics_log import MetricsLog
 
 # A stand-in for wandb that writes down what it is given, in a process of its own as the real one.
 STAND_IN = """

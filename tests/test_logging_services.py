@@ -13,8 +13,9 @@ import pytest
 from processes import LINES, RUN, has_written, stop_after, training
 
 from jaxpg.run import folder
-from jaxpg.run.folder import MetricsLog, RunFolder
+from jaxpg.run.folder import RunFolder
 from jaxpg.run.loggers import follower, values_of
+from jaxpg.run.metrics_log import MetricsLog
 
 
 def installed():

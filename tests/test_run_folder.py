@@ -13,7 +13,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from in_process import contents, ended
-from processes import RUN, outcome, proceed, stop_after, training, tree
+from processes import RUN, bound_by_permissions, outcome, proceed, stop_after, training, tree
 
 from jaxpg import compare, evaluate, export, inspect, report, train
 from jaxpg.run import cache, files, folder, lines, lock, versions
@@ -363,15 +363,12 @@ def test_what_is_in_place_of_a_file_is_said_in_one_line(run, name, kind, reader)
         assert (name if reader != "compare" else "") in one_line(ending)
 
 
-@pytest.mark.skipif(not shutil.which("setpriv"), reason="root reads everything, but for a process without that right")
 @pytest.mark.parametrize("name", ["config.yaml", "versions.json", "metrics.jsonl", "checkpoints", "best", "."])
 def test_what_may_not_be_read_is_said_in_one_line(command_environment, run, name):
     os.chmod(run / name, 0)
-    rights = "-dac_override,-dac_read_search"
-    without = ["setpriv", f"--bounding-set={rights}"] if os.geteuid() == 0 else []
     arguments = [sys.executable, "-m", "jaxpg.train", f"resume={run}", "total_steps=128"]
     result = subprocess.run(
-        [*without, *arguments], env=command_environment, capture_output=True, text=True, check=False
+        [*bound_by_permissions(), *arguments], env=command_environment, capture_output=True, text=True, check=False
     )
     assert result.returncode == 2, result.stderr
     assert len(result.stderr.splitlines()) == 1

@@ -89,11 +89,14 @@ class Checkpoints:
         """
         _silence_what_is_left_behind()
         descriptor = files.open_folder(self.folder, make=not self._read_only)
-        self._close = weakref.finalize(self, os.close, descriptor)
+        self._closing = weakref.finalize(self, os.close, descriptor)
         self._descriptor, self._place = descriptor, files.through(descriptor, self.folder)
         if not self._read_only:
             files.check_no_links(descriptor)
-        self._manager = ocp.CheckpointManager(self._place, item_names=("state", "meta"), options=self._options)
+        self._manager = self._managed()
+
+    def _managed(self) -> ocp.CheckpointManager:
+        return ocp.CheckpointManager(self._place, item_names=("state", "meta"), options=self._options)
 
     def latest(self) -> int | None:
         """The newest checkpoint's number, or None where there is none."""
@@ -167,16 +170,19 @@ class Checkpoints:
 
         A run folder that is gone is not made again.
         """
-        with files.opened(self.folder, make=True) as now:
-            same = os.path.sameopenfile(now, self._descriptor)
-        same = same and self._place == files.through(self._descriptor, self.folder)
         if self._failed:
             self._remove_unfinished()
-            self._close.detach()  # what still writes for the failed save must not get another folder by this number
+        if not self._is_there():
+            self._closing.detach()  # what still writes for a failed save must not get another folder by this number
             self._open()
-        elif not same:
-            self._close()
-            self._open()
+        elif self._failed:
+            self._manager = self._managed()
+
+    def _is_there(self) -> bool:
+        """Whether the open folder is the one that has the name now, which is made where there is none."""
+        with files.opened(self.folder, make=True) as now:
+            same = os.path.sameopenfile(now, self._descriptor)
+        return same and self._place == files.through(self._descriptor, self.folder)
 
     def _remove_unfinished(self) -> None:
         """What a failed save has left: it takes space."""

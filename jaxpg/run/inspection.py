@@ -54,7 +54,8 @@ def inspect(path: str) -> Inspection:
       UserError: it is no run folder, or its configuration or versions cannot be read.
     """
     run_folder = folder.find(path)
-    config, lines = configuration.load(run_folder.config), folder.read_metrics(run_folder)
+    config = configuration.load(run_folder.config)
+    lines = folder.read_metrics(run_folder, config.num_agents)
     prepare(config)  # as for a training, whose versions are compared
     stored = Checkpoints(run_folder.checkpoints, read_only=True)
     checkpoints = {number: _problem(stored, number, config) for number in stored.numbers()}

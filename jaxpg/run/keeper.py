@@ -5,7 +5,8 @@ from __future__ import annotations
 from collections.abc import Callable
 
 from jaxpg.run.config import Config
-from jaxpg.run.folder import MetricsLog, RunFolder
+from jaxpg.run.folder import RunFolder
+from jaxpg.run.metrics_log import MetricsLog
 from jaxpg.run.state import RunState
 
 
@@ -14,7 +15,6 @@ class Keeper:
 
     Args:
       config, folder: of the run.
-      log: its lines of metrics, which are written before a checkpoint that has them.
       say: takes notes.
 
     Attributes:
@@ -22,20 +22,25 @@ class Keeper:
       failed: whether the last save has failed.
     """
 
-    def __init__(self, config: Config, folder: RunFolder, log: MetricsLog, say: Callable[[str], None]):
+    def __init__(self, config: Config, folder: RunFolder, say: Callable[[str], None]):
         from jaxpg.run.checkpoint import Checkpoints  # and orbax, which is slow to import
 
         self._checkpoints = Checkpoints(folder.checkpoints)
         self._best = Checkpoints(folder.best, keep=1)
         self._meta = {"config": config.to_dict()}
-        self._log, self._say = log, say
+        self._say = say
         self._last: int | None = None  # the newest checkpoint of this process
         self.saved: int | None = None
         self.failed = False
 
-    def save(self, update: int, state: RunState) -> None:
-        """Saves the state after `update` updates; the first of several failures is said, and the end of them."""
-        problem = self._problem(update, state)
+    def save(self, update: int, state: RunState, log: MetricsLog) -> None:
+        """Saves the state after `update` updates; the first of several failures is said, and the end of them.
+
+        Args:
+          update, state: what is saved.
+          log: the lines of metrics, which are written before a checkpoint that has them.
+        """
+        problem = self._problem(update, state, log)
         if problem and not self.failed:
             self._say(f"note: {problem}; training goes on, and saving is tried again at each line of metrics")
         elif self.failed and not problem:
@@ -44,12 +49,12 @@ class Keeper:
         if not problem:
             self.saved = update
 
-    def _problem(self, update: int, state: RunState) -> str | None:
+    def _problem(self, update: int, state: RunState, log: MetricsLog) -> str | None:
         """Saves; what has kept it from that."""
         from jaxpg.run.checkpoint import SaveError
 
         try:
-            self._log.flush()  # first: a checkpoint whose lines are not there would be resumed with a gap
+            log.flush()  # first: a checkpoint whose lines are not there would be resumed with a gap
             if self._last != update:  # else only the best policy is missing
                 self._checkpoints.replace(update, state, self._meta)  # damaged ones may be newer than what was resumed
                 self._last = update

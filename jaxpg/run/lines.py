@@ -16,19 +16,24 @@ def json_line(line: Mapping[str, Any]) -> str:
     return json.dumps(line, allow_nan=False) + "\n"
 
 
-def sound(text: str) -> tuple[list[dict[str, Any]], list[int]]:
+def sound(text: str, agents: int | None = None) -> tuple[list[dict[str, Any]], list[int]]:
     """The lines of a run as they were written, and the numbers, from 1, of those that are damaged.
 
     Of a run all lines have the same number of agents and of steps per update, and their updates grow: a line that
     differs from most in that is damaged, too. A last line that is not whole is neither: a kill leaves it so.
+
+    Args:
+      text: the content of the file.
+      agents: of the run; None: as many as in most lines.
     """
     *texts, torn = text.split("\n")
     lines = [_parsed(one) for one in texts + [torn] * (_parsed(torn) is not None)]
+    lines = [line if line and agents in (None, _agents(line)) else None for line in lines]
     kinds = Counter(_kind(line) for line in lines if line)
     usual, last = max(kinds, key=kinds.__getitem__, default=None), 0
     found, damaged = [], []
     for number, line in enumerate(lines, 1):
-        if line and _kind(line) == usual and line["update"] > last:
+        if line and _agents(line) and _kind(line) == usual and line["update"] > last:
             found.append(line)
             last = line["update"]
         else:
@@ -48,10 +53,15 @@ def _parsed(text: str) -> dict[str, Any] | None:
     return line if numbers else None
 
 
-def _kind(line: Mapping[str, Any]) -> tuple[Any, float]:
+def _kind(line: Mapping[str, Any]) -> tuple[int, float]:
     """What all lines of a run have in common: how many agents, and steps per update."""
-    agents = {len(value) for value in line.values() if isinstance(value, list)}
-    return (*sorted(agents),), line["steps"] / line["update"]
+    return _agents(line), line["steps"] / line["update"]
+
+
+def _agents(line: Mapping[str, Any]) -> int:
+    """How many values there are of everything; 0 where the lists differ in that."""
+    numbers = {len(value) for value in line.values() if isinstance(value, list)} or {1}
+    return max(numbers) if len(numbers) == 1 else 0
 
 
 def _is_count(value: Any) -> bool:

@@ -22,9 +22,10 @@ from jaxpg.run.cache import compilation_cache, physics_cache, timed
 from jaxpg.run.chunks import PATIENCE, Watch, summary
 from jaxpg.run.config import Config
 from jaxpg.run.errors import UserError
-from jaxpg.run.folder import MetricsLog, RunFolder, jsonable
+from jaxpg.run.folder import RunFolder, jsonable
 from jaxpg.run.keeper import Keeper
 from jaxpg.run.loggers import follower
+from jaxpg.run.metrics_log import MetricsLog
 from jaxpg.run.names import own_metrics
 from jaxpg.run.program import Program, Schedule, compile_program, described_jump, make_env, plan
 from jaxpg.run.runtime import prepare
@@ -151,7 +152,7 @@ def _go_on(stored: Config, config: Config, run_folder: RunFolder) -> int:
         _draw(session)
         display.say(f"{run_folder.path} is finished; a larger total_steps goes on")
         return 0
-    if is_solved(config.run, results.best_returns(folder.read_metrics(run_folder))):
+    if is_solved(config.run, results.best_returns(folder.read_metrics(run_folder, config.num_agents))):
         display.say(f"{run_folder.path} has reached stop_return={config.run.stop_return:g}; a higher one goes on")
         return 0
     display.say(
@@ -208,8 +209,8 @@ def _train(session: Session, program: Program, state: RunState, compile_seconds:
     config, schedule, run_folder, display = session
     solved = False
     first = update = _update(state.train)
-    log = MetricsLog(run_folder, update, display.say, config.run.loggers)
-    keeper = Keeper(config, run_folder, log, display.say)
+    keeper = Keeper(config, run_folder, display.say)  # before the log, which has files and processes to close
+    log = MetricsLog(run_folder, update, display.say, config.run.loggers, config.num_agents)
     watch, watchdog = Watch(config, display.say, min(PATIENCE, schedule.num_updates)), Watchdog()
     began, seconds_before = time.monotonic(), log.seconds
     display.start()
@@ -234,9 +235,9 @@ def _train(session: Session, program: Program, state: RunState, compile_seconds:
                 log.write(line)
                 display.update(line)
                 if schedule.is_due(update, schedule.checkpoint_every) or keeper.failed:
-                    keeper.save(update, state)
+                    keeper.save(update, state, log)
             if update > first and keeper.saved != update:
-                keeper.save(update, state)
+                keeper.save(update, state, log)
     finally:
         display.stop()
         training_seconds = time.monotonic() - began
@@ -306,7 +307,7 @@ def _side_by_side(train: TrainState) -> TrainState:
 def _draw(session: Session) -> list[dict[str, Any]]:
     """Draws the learning curve, if it can be written; returns the lines of metrics that it shows."""
     config, run_folder = session.config, session.run_folder
-    lines, title = folder.read_metrics(run_folder), agents.described(config)
+    lines, title = folder.read_metrics(run_folder, config.num_agents), agents.described(config)
     picture = io.BytesIO()
     if config.sweep:
         figures.sweep_curves(lines, picture, title, results.curves(config, lines))

@@ -106,7 +106,8 @@ def _task(agent: Agent) -> str:
 
 def _agents(path: str) -> Iterator[Agent]:
     run_folder = folder.find(path)
-    config, lines = configuration.load(run_folder.config), folder.read_metrics(run_folder)
+    config = configuration.load(run_folder.config)
+    lines = folder.read_metrics(run_folder, config.num_agents)
     for i in range(config.num_agents):
         own = alone(config, i)
         curves = {

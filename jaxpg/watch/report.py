@@ -58,7 +58,7 @@ def report(run_folder: RunFolder, config: Config, stages: Mapping[str, StoredPol
       run_folder, config: of the run.
       stages: one agent at some points of its training, by what they are called.
     """
-    lines, stored = folder.read_metrics(run_folder), next(iter(stages.values()))
+    lines, stored = folder.read_metrics(run_folder, config.num_agents), next(iter(stages.values()))
     number = min(PLAYED, config.run.eval_episodes)
     starts = jax.random.split(jax.random.key(SELECTION_SEED), config.run.eval_episodes)[:number]
     recordings = record(stored, [stage.policy for stage in stages.values()], starts)

@@ -74,12 +74,9 @@ def damage(path, kind, position, other, outside):
         if path.is_file():
             path.write_bytes(altered(path.read_bytes(), kind, position))
         return
-    copy = outside / "copy" / path.name
+    copy = Path(tempfile.mkdtemp(dir=outside), path.name)
     if path.exists():
-        copy.parent.mkdir(exist_ok=True)
-        shutil.rmtree(copy, ignore_errors=True)
         (shutil.copytree if path.is_dir() else shutil.copyfile)(path, copy)
-    path.parent.mkdir(exist_ok=True)
     remove(path)
     if kind == "of another run" and other.exists():
         (shutil.copytree if other.is_dir() else shutil.copyfile)(other, path)
@@ -92,6 +89,12 @@ def damage(path, kind, position, other, outside):
     elif "link" in kind:
         targets = {"link to a copy": copy, "link to a file": outside / "file", "link to a folder": outside / "folder"}
         path.symlink_to(targets.get(kind, outside / "missing" if kind == "dangling link" else path))
+
+
+def is_own(path, run):
+    """Whether the damages before have left it, or its place, in the folder."""
+    parents = [parent for parent in path.parents if run in parent.parents]
+    return not path.is_symlink() and all(parent.is_dir() and not parent.is_symlink() for parent in parents)
 
 
 def altered(content, kind, position):
@@ -146,7 +149,8 @@ def try_one(runs, damages, command):
         for name in ("file", "folder/file"):
             (outside / name).write_text("not yours\n")
         for name, kind, position in damages:
-            damage(run / name, kind, position, runs / "other" / name, outside)
+            if is_own(run / name, run):
+                damage(run / name, kind, position, runs / "other" / name, outside)
         before = contents(outside)
         module, arguments = COMMANDS[command]
         ending = ended(module.main, [argument.format(run=run) for argument in arguments])
