@@ -69,10 +69,9 @@ def test_commands_are_the_formulas(name, form, written):
     assert obs.shape == (10_000, control.observation_size)
     tried = trial(control, obs)
     assert tried.exact.std() > 0.01  # they differ, and are not all at a limit
-    assert tried.tolerance == TOLERANCE  # none of them is steep
     found = np.asarray(jax.jit(command)(obs)) if form == "jax" else FORMATS[form].load(control, folder)(obs)
     assert found.shape == (10_000, control.action_size)
-    assert tried.error(found) <= TOLERANCE
+    assert tried.error(found) <= TOLERANCE  # none of them is steep
 
 
 @pytest.mark.parametrize("name", POLICIES)
@@ -166,7 +165,7 @@ def test_a_thousand_updates_in_c_are_those_of_jax(name, double, tmp_path):
         kind = np.float64 if double else np.float32
         policy, steps = jax.tree.map(lambda x: jnp.asarray(np.asarray(x, kind)), (stored.policy, transition))
         scale = np.asarray(control.scale, kind)  # what is written is rounded to float
-        policy = policy._replace(normalizer=policy.normalizer._replace(variance=jnp.asarray(scale**-2 - 1e-6)))
+        policy = policy._replace(normalizer=policy.normalizer._replace(variance=jnp.asarray(scale**-2)))
         expected = learning.learned(networks, stored.config.algo, policy, control.learner.log_std.astype(kind), steps)
         assert expected.dtype == kind
         expected = np.asarray(expected)
@@ -232,7 +231,7 @@ def test_all_formats_of_a_run(run, command):
     )
     assert re.fullmatch(
         r"tried +on 10,000 observations, \d,\d{3} of them played and the others drawn; "
-        r"errors in units of the action's bound, 1, against float64",
+        r"errors in units of the largest command, against float64",
         tried,
     )
     assert [line.split()[0] for line in lines] == ["jax", *FORMATS]

@@ -94,6 +94,7 @@ def test_a_link_in_the_place_of_a_runs_folder_is_not_followed(tmp_path):
     run.mkdir()
     elsewhere.mkdir()
     (run / "config.yaml").write_text("")
+    (run / "best").mkdir()
     (run / "export").symlink_to(elsewhere)
     with pytest.raises(UserError, match="it is a link"):
         command_line.main([f"run={run}", "overwrite=true"])

@@ -29,7 +29,7 @@ from jaxpg.run.schema import Online
 from jaxpg.run.state import Policy
 
 FARTHEST = 1e6  # deviations from training's mean: beyond, an observation is not valid
-NUM_OBSERVATIONS = 10_000  # on which what was written is compared with JAX
+NUM_OBSERVATIONS = 10_000  # on which a controller is tried
 NUM_EPISODES = 50
 FAR = 10.0
 

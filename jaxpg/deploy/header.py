@@ -96,7 +96,7 @@ static inline int policy_limited(const policy_real *u, policy_real *command) {{
 }}
 
 /* The command for an observation, both in the units above. Returns 1; or 0, with every command 0, if the observation is
-   not valid: if a number of it is NaN, infinite, or more than {farthest:g} deviations from training's mean. */
+   not valid: if a number of it is NaN, infinite, or over a million deviations from training's mean. */
 static inline int policy_command(const policy_real observation[POLICY_OBSERVATIONS],
                                  policy_real command[POLICY_COMMANDS]) {{
     policy_real x[{width}], y[{width}];
@@ -185,7 +185,13 @@ def _about(controller: Controller) -> list[str]:
     lines = [f"{name}: {text}" for name, text in controller.origin.items()]
     lines += ["", *(f"observation[{i}]: {name}" for i, name in enumerate(names))]
     lines += [f"command[{i}]: {name}{bound}" for i, (name, bound) in enumerate(zip(commands, bounds, strict=True))]
-    return [f"/* {NO_SEAL}", " * A controller trained by jaxpg.", " *", *(f" * {in_comment(x)}" for x in lines), " */"]
+    return [
+        f"/* {NO_SEAL}",
+        " * A controller trained by jaxpg.",
+        " *",
+        *(f" * {in_comment(x)}".rstrip() for x in lines),
+        " */",
+    ]
 
 
 def _arrays(controller: Controller) -> list[str]:

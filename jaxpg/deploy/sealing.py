@@ -64,7 +64,7 @@ def _is_free(path: Path) -> bool:
         return is_sealed(read(path))
     except FileNotFoundError:
         return not os.path.lexists(path)
-    except OSError:  # it cannot be read, or is no file
+    except OSError:  # it cannot be read, or is no file of its own
         return False
 
 
