@@ -38,7 +38,7 @@ def main(arguments: Sequence[str]) -> int:
 
 
 def console_script() -> None:
-    """The command `jaxpg` that pip installs."""
+    """The command `jaxpg`, which comes with the package."""
     run_command(main)
 
 

@@ -121,6 +121,20 @@ def test_the_command_takes_folders_with_any_name(run, tmp_path, capsys, monkeypa
     assert "algo=ppo" in (tmp_path / "both.html").read_text()
 
 
+def test_what_is_no_run_is_left_out_with_a_note(run, tmp_path, capsys, monkeypatch):
+    """`runs/*` finds the page that was written there before."""
+    monkeypatch.chdir(tmp_path)
+    run("a", [-1.0], "algo=td")
+    run("b", [-2.0], "algo=ppo")
+    (tmp_path / "comparison.html").write_text("<!DOCTYPE html>")
+    (tmp_path / "notes").mkdir()
+    assert compare.main(["a", "b", "comparison.html", "notes", "out=comparison.html"]) == 0
+    assert capsys.readouterr().out.startswith("note: left out, as it is no run folder: comparison.html, notes\n")
+    assert "algo=ppo" in (tmp_path / "comparison.html").read_text()
+    with pytest.raises(UserError, match="nowhere is not a run folder"):
+        compare.main(["a", "b", "nowhere", "out=comparison.html"])
+
+
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [([], "run folders are missing"), (["nowhere"], "nowhere is not a run folder"), (["."], "not a run folder")],

@@ -9,6 +9,7 @@ import pytest
 
 from envs import hints, playground_env
 from envs.options import OptionError
+from jaxpg.deploy.export import FORMATS
 from jaxpg.run import episodes
 from jaxpg.run.errors import UserError
 from jaxpg.run.loggers import follower
@@ -63,17 +64,13 @@ def _pendulum():
 
 
 def without_onnx(monkeypatch):
-    from jaxpg.deploy import onnx
-
     monkeypatch.setitem(sys.modules, "onnx", None)
-    onnx.write(None, Path())
+    FORMATS["onnx"].check()
 
 
-def without_onnxruntime(monkeypatch):
-    from jaxpg.deploy import onnx
-
-    monkeypatch.setitem(sys.modules, "onnxruntime", None)
-    onnx.load(None, Path())
+def without_flatbuffers(monkeypatch):
+    monkeypatch.setitem(sys.modules, "flatbuffers", None)
+    FORMATS["stablehlo"].check()
 
 
 def without_a_logger(monkeypatch):
@@ -94,7 +91,7 @@ def without_playground(monkeypatch):
 MISSING = {
     without_gymnasium: "gymnasium",
     without_onnx: "onnx onnxruntime",
-    without_onnxruntime: "onnxruntime",
+    without_flatbuffers: "flatbuffers",
     without_a_logger: "wandb",
     without_av: "av",
     without_playground: "playground",
@@ -113,4 +110,4 @@ def test_no_message_names_another_pip():
     root = Path(hints.__file__).parents[1]
     for path in [*(root / "envs").rglob("*.py"), *(root / "jaxpg").rglob("*.py")]:
         if path.name != "hints.py":
-            assert "pip install" not in path.read_text(encoding="utf-8"), path
+            assert "pip install " not in path.read_text(encoding="utf-8"), path

@@ -5,6 +5,7 @@ from envs.physics.interpreter import scalarize
 from envs.physics.models import MujocoModelError, compile_model, ignored_features, load_spec
 from envs.physics.rules import UnsupportedPrimitive
 from envs.physics.step import PHYSICS, compile_step
+from envs.physics.variants import differing_fields
 
 __all__ = [
     "PHYSICS",
@@ -14,6 +15,7 @@ __all__ = [
     "check_once",
     "compile_model",
     "compile_step",
+    "differing_fields",
     "ignored_features",
     "load_model",
     "load_spec",

@@ -8,13 +8,14 @@ from __future__ import annotations
 
 import contextlib
 import errno
-import fcntl
 import os
 import secrets
 import stat
 from collections.abc import Iterator
 from pathlib import Path
 from typing import BinaryIO
+
+from jaxpg.run.posix import fcntl
 
 UNFINISHED = ".unfinished"  # ends the name of a file that is renamed once it is complete
 FOLDER = os.O_RDONLY | os.O_DIRECTORY

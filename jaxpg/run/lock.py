@@ -15,11 +15,7 @@ from pathlib import Path
 
 from jaxpg.run import files
 from jaxpg.run.errors import UserError
-
-try:
-    import fcntl
-except ImportError:  # Windows has neither these locks nor the signals that stop a run
-    raise UserError("runs need Linux or macOS; on Windows start this command in WSL, see docs/runs.md") from None
+from jaxpg.run.posix import fcntl
 
 NAME = "lock"
 LONGEST = 200  # bytes of an owner's name: what is in the file may be somebody else's words
