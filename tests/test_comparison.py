@@ -19,7 +19,7 @@ from jaxpg.watch.methods import methods, standings
 
 @pytest.fixture
 def run(tmp_path):
-    """`run(name, returns, *options)`: a folder as a run leaves it, with an evaluation for each row of returns, every so many steps."""
+    """`run(name, returns, *options)`: a folder as a run leaves it, with an evaluation for each row of returns."""
 
     def make(name, returns, *options, success=None, every=100):
         folder = tmp_path / name

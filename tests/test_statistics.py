@@ -184,7 +184,9 @@ def test_the_interval_of_an_improvement_holds_the_truth_as_often_as_it_says(shif
     assert 0.92 <= held / 1000 <= 0.985
 
 
-@pytest.mark.parametrize(("S", "R"), [(1, 1), (1, 3), (1, 100), (2, 7), (3, 3), (3, 4), (2, 8), (3, 5), (4, 4), (20, 20)])
+@pytest.mark.parametrize(
+    ("S", "R"), [(1, 1), (1, 3), (1, 100), (2, 7), (3, 3), (3, 4), (2, 8), (3, 5), (4, 4), (20, 20)]
+)
 def test_better_in_every_pair_is_as_sure_as_the_exact_rank_test_says(S, R):
     """All of X above all of Y: an interval leaves out one half where the test's probability is below 0.05, and is none
     where no outcome can be; it is never a point. One seed alone says nothing of how seeds differ."""

@@ -43,9 +43,10 @@ def attempt(what: str, draw: Callable[[], Drawn], say: Callable[[str], None]) ->
 
 
 def described(error: Exception) -> str:
-    """An exception in one line, such as `KeyError: 'distance' (player.py, line 144)`."""
+    """An exception in one line, such as `KeyError: 'distance' (player.py, line 144)`: the place outside of libraries."""
     name = type(error).__name__
     text = " ".join(str(error).split())
     frames = traceback.extract_tb(error.__traceback__)
-    place = f" ({Path(frames[-1].filename).name}, line {frames[-1].lineno})" if frames else ""
+    own = [frame for frame in frames if "site-packages" not in frame.filename] or frames
+    place = f" ({Path(own[-1].filename).name}, line {own[-1].lineno})" if own else ""
     return f"{name}: {text}{place}" if text else f"{name}{place}"

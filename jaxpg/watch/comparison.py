@@ -59,7 +59,7 @@ def _form(out: Path) -> Callable[[Sequence[Method]], str | bytes]:
 def comparison(found: Sequence[Method]) -> Json:
     """What the page shows of some methods, as plain values."""
     shown, whose = found[:MOST], f"{len(found)} methods" if len(found) > 1 else found[0].label
-    rows = [{"title": "methods, the best first", "columns": columns(found), "rows": table(found)}]
+    rows = [{"title": "methods, the best first", "columns": columns(found), "rows": table(found), "note": None}]
     data = {
         "kind": "comparison",
         "title": f"{whose} on {task(found[0].agents[0])}",
