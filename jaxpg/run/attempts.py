@@ -43,7 +43,7 @@ def attempt(what: str, draw: Callable[[], Drawn], say: Callable[[str], None]) ->
 
 
 def described(error: Exception) -> str:
-    """An exception in one line, such as `KeyError: 'distance' (player.py, line 144)`: the place outside of libraries."""
+    """An exception in one line, such as `KeyError: 'x' (player.py, line 144)`: the place outside of libraries."""
     name = type(error).__name__
     text = " ".join(str(error).split())
     frames = traceback.extract_tb(error.__traceback__)

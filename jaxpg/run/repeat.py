@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
+import re
 import shlex
-import sys
 from collections.abc import Mapping
 from typing import Any
 
-import envs
 from jaxpg.run import config as configuration
+from jaxpg.run import registered
 from jaxpg.run.config import Config
 
 NOT_REPEATED = ("run_dir",)  # its folder is not empty any more
+NO_WORDS = ("null", "true", "false", "inf", "nan")  # but values
 MOST = 5  # rounds until a command is complete: an option can change the default of another
 
 
@@ -30,7 +31,8 @@ def command(config: Config) -> str:
     for _ in range(MOST):
         missing = _differences(config, _composed(given))
         if not missing:
-            return " ".join([_program(config), *(shlex.quote(argument(*option)) for option in given.items())])
+            program = registered.command(config.choices["env"], "train")
+            return " ".join([program, *(shlex.quote(argument(*option)) for option in given.items())])
         given |= missing
     raise RuntimeError(f"no command line for {given}")
 
@@ -69,13 +71,5 @@ def _text(value: Any) -> str:
 
 def _quoted(word: str) -> str:
     """A word that Hydra's grammar reads as itself, in quotes where it has to be."""
-    plain = word.replace("_", "").replace("-", "").isalnum() and not word[0].isdigit()
+    plain = re.fullmatch(r"[A-Za-z][A-Za-z0-9_]*", word) and word.lower() not in NO_WORDS
     return word if plain else "'" + word.replace("'", "\\'") + "'"
-
-
-def _program(config: Config) -> str:
-    """What has the environment: this library's command, or the script that registers one of its own."""
-    module = envs.find(config.choices["env"]).config.__module__
-    if module.split(".")[0] == "envs":
-        return "python -m jaxpg.train"
-    return f"python {shlex.quote(str(getattr(sys.modules.get(module), '__file__', None) or 'SCRIPT'))} train"
