@@ -100,7 +100,7 @@ def picture(model: Any) -> Picture:
     axes, data = camera(model), mujoco.MjData(model)
     mujoco.mj_kinematics(model, data)
     mujoco.mj_comPos(model, data)
-    geoms = _geoms(model)
+    geoms = drawn_geoms(model)
     parts = [Part(i, *_outline(model, i), _color(_rgba(model, i))) for i in geoms] or _bodies(model)
     if not parts:
         raise NotDrawn("the model has no geoms and no bodies")
@@ -109,7 +109,8 @@ def picture(model: Any) -> Picture:
     return Picture(model, axes, parts, not geoms, _motors(model, axes))
 
 
-def _geoms(model: Any) -> list[int]:
+def drawn_geoms(model: Any) -> list[int]:
+    """The visible ones; where there is none, all; planes and height fields left out."""
     endless = (mujoco.mjtGeom.mjGEOM_PLANE, mujoco.mjtGeom.mjGEOM_HFIELD)
     drawn = [int(i) for i in np.flatnonzero(~np.isin(model.geom_type, endless)) if _rgba(model, i)[3]]
     return [i for i in drawn if model.geom_group[i] < 3] or drawn
