@@ -26,7 +26,10 @@ def run(tmp_path):
         folder.mkdir()
         config = compose([*options, f"run_dir={folder}"])
         (folder / "config.yaml").write_text(configuration.to_yaml(config))
-        lines = [{"update": i, "steps": every * (i + 1), "eval_return": row} for i, row in enumerate(returns)]
+        lines = [
+            {"update": i, "steps": every * i, "seconds": 1.0 * i, "eval_return": row}
+            for i, row in enumerate(returns, 1)
+        ]
         for line in lines:
             line |= {"eval_success": success} if success is not None else {}
         (folder / "metrics.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines))

@@ -39,7 +39,7 @@ BARE = """<mujoco><worldbody>
     <body><joint name="hinge" axis="0 -1 0"/><inertial pos="0 0 .3" mass=".1" diaginertia=".003 .003 .0001"/></body>
   </body></worldbody><actuator><motor joint="slide"/><motor joint="hinge"/></actuator></mujoco>"""
 
-UNKNOWN = "which of the model's 2 actuators the policy's 1 commands drive is not known"
+UNKNOWN = "the policy has 1 command, the model 2 actuators: which drives which?"
 
 
 @dataclass(frozen=True)
@@ -133,8 +133,7 @@ def test_a_success_that_is_no_number_and_a_goal_without_a_distance(shown):
     assert {row[3] for row in points} <= {0, 1}
     assert (data["workspace"]["x"], data["workspace"]["y"]) == ("x [m]", "z [m]")
     assert data["notes"] == []
-    known = [row[2] for row in data["head"]["rows"]]
-    assert all(text == "100.0 %" or text == "n/a" for text in known)  # x / x, of those that are numbers
+    assert all(0 <= float(row[2].removesuffix(" %")) <= 100 for row in data["head"]["rows"])
 
 
 @pytest.mark.parametrize("xml", [ROBOT.format(more='group="3"'), BARE], ids=["group 3", "no geoms"])

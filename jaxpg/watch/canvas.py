@@ -121,7 +121,7 @@ def _prepared(model: Any, width: int, height: int, ratio: float) -> Any:
 def _options(model: Any) -> Any:
     """Of a model without visible geoms all are drawn, and of one without any the inertias of its bodies."""
     options, geoms = mujoco.MjvOption(), drawn_geoms(model)
-    options.geomgroup[model.geom_group[geoms]] = 1
+    options.geomgroup[np.minimum(model.geom_group[geoms], len(options.geomgroup) - 1)] = 1
     options.flags[mujoco.mjtVisFlag.mjVIS_INERTIA] = not geoms
     return options
 

@@ -84,7 +84,8 @@ def _motors(stored: StoredPolicy, picture: drawing.Picture) -> list[Json]:
     """The driven hinges with their commands, where each command is that of the actuator with its number."""
     names, number = command_names(stored), picture.model.nu
     if len(names) != number:
-        raise NotDrawn(f"which of the model's {number} actuators the policy's {len(names)} commands drive is not known")
+        commands = "command" if len(names) == 1 else "commands"
+        raise NotDrawn(f"the policy has {len(names)} {commands}, the model {number} actuators: which drives which?")
     limits = _limits(stored)
     return [
         {"name": names[motor.command], "limit": limits.get(names[motor.command]), "sign": motor.sign}

@@ -30,7 +30,7 @@ from jaxpg.watch.smoothness import NEAR, chatter, share_at_limit
 
 Json = dict[str, Any]
 Stages = Mapping[str, StoredPolicy]
-MOST = 2**20  # steps that are recorded of each policy: of longer episodes not all that an evaluation plays
+MOST = 2**18  # steps that are recorded of each policy: of longer episodes not all that an evaluation plays
 UNTRAINED = "before training"
 SMOOTHNESS = (
     "Chatter: the mean of |u(t) \u2212 u(t \u2212 1)| / (2 limit) over steps and commands u, 0 % where they stand "
