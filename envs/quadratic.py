@@ -15,6 +15,7 @@ limits, and nothing ever terminates.
 
 from __future__ import annotations
 
+import dataclasses
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -158,6 +159,11 @@ class LinearQuadratic:
             for name, n in (("s", self.observation_size), ("a", self.action_size))
         )
         return Interface(states, actions, limits=None)
+
+    @property
+    def references(self) -> dict[str, float]:
+        """What an episode can earn at best, on average; undiscounted, as returns are."""
+        return {"best possible": optimum(dataclasses.replace(self.problem, discount=1.0))}
 
     def reset(self, rng: jax.Array) -> State:
         """s_0 ~ N(m_0, S_0)."""
@@ -339,3 +345,11 @@ def riccati_gains(problem: Problem) -> list[np.ndarray]:
         gains.append(-np.linalg.solve(P[n:, n:], P[n:, :n]))
         following = backup(problem, Policy(gains[-1], np.zeros(m), 0.0), following)
     return gains[::-1]
+
+
+def optimum(problem: Problem) -> float:
+    """J of the `riccati_gains`, the largest there is: E[V_0(s_0)]."""
+    following = zero(problem)
+    for K in reversed(riccati_gains(problem)):
+        following = backup(problem, Policy(K, np.zeros(len(K)), 0.0), following)
+    return float(following(problem.initial_mean) - np.trace(following.P @ problem.initial_covariance))

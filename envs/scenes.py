@@ -1,12 +1,13 @@
 """How the states of an environment look: for videos and reports, never for training.
 
 An environment that can be looked at has a `scene`; brax's own have a MuJoCo model too. One whose state is a point of a
-plane may have a `phase_plane`, over which a value function is drawn as a map.
+plane may have a `phase_plane`, over which a value function is drawn as a map. One that knows what a return is worth may
+have `references`: returns by what they are, such as `{"best possible": -137.4}`.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple
 
 import jax
@@ -52,3 +53,8 @@ def scene(env: Any) -> Scene | None:
         return env.scene
     model = getattr(getattr(env, "sys", None), "mj_model", None)  # brax's
     return Scene(model, lambda state: state.pipeline_state.q) if model is not None else None
+
+
+def references(env: Any) -> Mapping[str, float]:
+    """Returns to compare with, by what they are; empty where the environment knows none."""
+    return getattr(env, "references", {})

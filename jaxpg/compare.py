@@ -1,4 +1,4 @@
-"""`python -m jaxpg.compare runs/*`: several runs side by side, as a table and as a page."""
+"""`python -m jaxpg.compare runs/*`: several runs side by side, as a page, a figure or a table."""
 
 from __future__ import annotations
 

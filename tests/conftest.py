@@ -12,6 +12,8 @@ import pytest
 jax.config.update("jax_debug_key_reuse", True)
 jax.config.update("jax_num_cpu_devices", 2)  # for the tests of shards
 
+os.environ.setdefault("JAXPG_RAISE", "1")  # bugs in what is drawn of a run are raised, also in commands
+
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:  # as in the background of a shell: commands would be deaf to it
     signal.signal(signal.SIGINT, signal.default_int_handler)
 

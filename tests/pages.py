@@ -20,24 +20,30 @@ def packed(values: np.ndarray) -> str:
     return base64.b64encode(np.rint(values).astype("<i2").tobytes()).decode("ascii")
 
 
+def panel(title: str, *series: Json, references: Any = ()) -> Json:
+    return {"title": title, "x": "environment steps", "references": list(references), "series": list(series)}
+
+
 def curve(label: str, final: float, rate: float, width: float | None = 4.0, number: int = 25) -> Json:
     """A return that rises from -1200 as an exponential; `width` of its interval at the end, None without one."""
     steps = np.linspace(0, 960_000, number)
     mean = final - (1200 + final) * np.exp(-rate * steps / 1e5)
     spread = None if width is None else width * (1 + 20 * np.exp(-rate * steps / 1e5))
     low, high = (None, None) if spread is None else ((mean - spread).tolist(), (mean + spread).tolist())
-    return {"label": label, "steps": steps.tolist(), "mean": mean.tolist(), "low": low, "high": high}
+    band = None if spread is None else "16 seeds, 95 % interval"
+    return {"label": label, "steps": steps.tolist(), "mean": mean.tolist(), "low": low, "high": high, "band": band}
 
 
 def document(kind: str, title: str, **parts: Any) -> Json:
     """Everything that a page is given; parts that are not named are not there."""
-    absent: Json = {"player": None, "portrait": None, "workspace": None, "improvement": None}
-    lists: Json = {"facts": [], "curves": [], "tables": [], "configuration": [], "versions": []}
+    absent: Json = dict.fromkeys(("head", "player", "portrait", "workspace", "improvement", "command"))
+    lists: Json = {"facts": [], "notes": [], "curves": [], "diagnostics": [], "tables": []}
+    lists |= {"configuration": [], "versions": []}
     return {"kind": kind, "title": title} | lists | absent | parts
 
 
 def episode(parts: np.ndarray, motors: np.ndarray, goal: Any, series: dict[str, np.ndarray], **more: Any) -> Json:
-    """An EPISODE of ends of capsules `[F, P, 4]` and places of motors `[F, M, 2]`."""
+    """An EPISODE of places and turned axes of parts `[F, P, 8]`, and of places of motors `[F, M, 2]`."""
     scale = max(np.abs(parts).max(), np.abs(motors).max()) / INT16
     return {
         "return": float(np.sum(series["reward"])),
@@ -50,6 +56,17 @@ def episode(parts: np.ndarray, motors: np.ndarray, goal: Any, series: dict[str, 
         "series": {name: values.tolist() for name, values in series.items()},
         "path": None,
     } | more
+
+
+def along(length: float) -> list[list[float]]:
+    """The ends of a rod that lies along the x axis of its frame."""
+    return [[0.0, 0.0, 0.0], [length, 0.0, 0.0]]
+
+
+def rod(x: Any, y: Any, angle: np.ndarray) -> np.ndarray:
+    """A frame at x, y whose x axis is turned by the angle in the plane: `[F, 8]`."""
+    zero, cos, sin = 0 * angle, np.cos(angle), np.sin(angle)
+    return np.stack([x + zero, y + zero, cos, -sin, zero, sin, cos, zero], axis=-1)
 
 
 def policies(play: Callable[[int, int], Json], episodes: int = 3) -> list[Json]:
@@ -76,10 +93,9 @@ def swing(policy: int, number: int) -> Json:
         speed = -start * np.exp(-time) * (np.cos(3 * time) + 3 * np.sin(3 * time))
     torque = (0.2 if policy == 0 else 2.0) * np.cos(3 * time[:-1]) * np.exp(-time[:-1] / 2)
     reward = -(wrapped(angle[:-1]) ** 2) - 0.1 * speed[:-1] ** 2 - 0.001 * torque**2
-    tip = np.stack([-ROD * np.sin(angle), ROD * np.cos(angle)], axis=-1)
-    ends = np.concatenate([np.zeros_like(tip), tip], axis=-1)[:, None]
+    parts = rod(0, 0, angle + np.pi / 2)[:, None]
     series = {"torque [N m]": torque, "reward": reward, "value": -20 * np.exp(-time[:-1]) * policy}
-    return episode(ends, np.zeros((len(time), 1, 2)), None, series, path=[wrapped(angle).tolist(), speed.tolist()])
+    return episode(parts, np.zeros((len(time), 1, 2)), None, series, path=[wrapped(angle).tolist(), speed.tolist()])
 
 
 def value_grid(scale: float) -> Json:
@@ -95,8 +111,9 @@ def pendulum(**changes: Any) -> Json:
     player = {
         "dt": DT,
         "view": [-1.25, -1.25, 1.25, 1.25],
-        "parts": [{"radius": 0.05, "color": "#cc4d4d"}],
+        "parts": [{"points": along(ROD), "radius": 0.05, "color": "#cc4d4d"}],
         "motors": [{"name": "torque [N m]", "limit": 2.0, "sign": 1}],
+        "limits": {"torque [N m]": 2.0},
         "goal_radius": None,
         "series": ["torque [N m]", "reward", "value"],
         "policies": policies(swing),
@@ -109,16 +126,24 @@ def pendulum(**changes: Any) -> Json:
     }
     parts = {
         "facts": [["return", "-147.2 at the end, -147.1 at best"], ["steps", "1,000,000"]],
+        "head": {
+            "title": "policies",
+            "columns": ["policy", "return", "chatter"],
+            "rows": [["before training", "-1170.0 ± 23.8", "0.4 %"], ["best", "-147.2 ± 2.1", "13.0 %"]],
+            "note": "mean and standard error",
+        },
         "curves": [
-            {
-                "title": "return",
-                "x": "environment steps",
-                "series": [curve("deterministic policy", -147.0, 1.2), curve("while training", -160.0, 0.8, None)],
-            }
+            panel(
+                "return",
+                *(curve("deterministic policy", -147.0, 1.2), curve("while training", -160.0, 0.8, None)),
+                references=[{"label": "best possible", "value": -137.4}, {"label": "far away", "value": -1e5}],
+            )
         ],
+        "diagnostics": [panel("KL divergence of an update", curve("while training", 0.01, 1.0, None))],
+        "command": "python -m jaxpg.train env=pendulum env.mass=2.0",
         "player": player,
         "portrait": portrait,
-        "configuration": [["env", "pendulum"], ["env.mass", "1.0"], ["algo.gamma", "0.97"]],
+        "configuration": [["env", "pendulum", None], ["env.mass", "2.0", "1.0"], ["algo.gamma", "0.97", None]],
         "versions": [["jax", "0.10.1"], ["mujoco", "3.17.0"]],
     }
     return document("run", "ppo on pendulum, seed 0", **parts | changes)
@@ -134,7 +159,7 @@ def reach(policy: int, number: int) -> Json:
     tip = elbow + LINKS[1] * np.stack([np.cos(fore), np.sin(fore)], axis=-1)
     goal = LINKS[0] * np.exp(1j * goal_angles[0]) + LINKS[1] * np.exp(1j * goal_angles.sum())
     distance = np.hypot(tip[:, 0] - goal.real, tip[:, 1] - goal.imag)
-    parts = np.stack([np.concatenate([0 * elbow, elbow], -1), np.concatenate([elbow, tip], -1)], axis=1)
+    parts = np.stack([rod(0, 0, upper), rod(*elbow.T, fore)], axis=1)
     torques = {f"{name} torque [N m]": 2 * size * np.exp(-2 * time[:-1]) for name, size in JOINTS.items()}
     series = torques | {"reward": -distance[:-1], "value": -5 * distance[:-1]}
     motors = np.stack([0 * elbow, elbow], axis=1)
@@ -154,17 +179,19 @@ def arm(**changes: Any) -> Json:
     player = {
         "dt": DT,
         "view": [-1.1, -1.1, 1.1, 1.1],
-        "parts": [{"radius": 0.03, "color": "#4d66cc"}, {"radius": 0.025, "color": "#4d99e6"}],
+        "parts": [
+            {"points": along(length), "radius": radius, "color": color}
+            for length, radius, color in zip(LINKS, (0.03, 0.025), ("#4d66cc", "#4d99e6"), strict=True)
+        ],
         "motors": [{"name": f"{name} torque [N m]", "limit": 2.0, "sign": 1} for name in JOINTS],
+        "limits": {f"{name} torque [N m]": 2.0 for name in JOINTS},
         "goal_radius": 0.05,
         "series": [*(f"{name} torque [N m]" for name in JOINTS), "reward", "value"],
         "policies": policies(reach),
     }
     parts = {
         "facts": [["return", "-11.8 at the end"], ["steps", "1,000,000"]],
-        "curves": [
-            {"title": "return", "x": "environment steps", "series": [curve("deterministic policy", -12.0, 1.0)]}
-        ],
+        "curves": [panel("return", curve("deterministic policy", -12.0, 1.0))],
         "player": player,
         "workspace": {
             "title": "success over the workspace",
@@ -183,10 +210,7 @@ def comparison(**changes: Any) -> Json:
     rewards = [curve(label, -1.0 - i, 1.2, None) for i, label in enumerate(labels[:2])]
     parts = {
         "facts": [["runs", "3"], ["seeds", "16 of each"]],
-        "curves": [
-            {"title": "return", "x": "environment steps", "series": returns},
-            {"title": "reward", "x": "environment steps", "series": rewards},
-        ],
+        "curves": [panel("return", *returns), panel("reward", *rewards)],
         "tables": [
             {
                 "title": "Runs, the best first",
@@ -195,6 +219,7 @@ def comparison(**changes: Any) -> Json:
                     [label, f"-{147 + 20 * i}.1 [-{152 + 20 * i}.0, -{143 + 20 * i}.2]", "16"]
                     for i, label in enumerate(labels)
                 ],
+                "note": None,
             }
         ],
         "improvement": {

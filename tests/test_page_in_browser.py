@@ -115,7 +115,7 @@ def test_the_keyboard_moves_the_player(show):
 def test_every_control_is_reached_by_tab_with_a_visible_focus(show):
     tab = show(pages.pendulum())
     reached = []
-    for _ in range(9):
+    for _ in range(10):
         tab.keyboard.press("Tab")
         code = """() => {
           const at = document.activeElement;
@@ -123,7 +123,7 @@ def test_every_control_is_reached_by_tab_with_a_visible_focus(show):
           return [at.id || at.name || at.className || at.localName, getComputedStyle(shown).outlineStyle];
         }"""
         reached.append(tab.evaluate(code))
-    names = ["theme", "policy", "episode", "ghost", "stage", "play", "scrub", "speed", "curve"]
+    names = ["theme", "scrolled", "policy", "episode", "ghost", "stage", "play", "scrub", "speed", "curve"]
     assert reached == [[name, "solid"] for name in names]
 
 
@@ -165,6 +165,34 @@ def test_torques_are_arcs_from_the_top_counter_clockwise_if_positive(show, torqu
         place = 0.09 * 2.5 * 1j * np.exp(1j * np.radians(turn) * np.sign(torque * sign))
         is_drawn = stage_pixel(tab, data, place.real, place.imag) == (194, 78, 0)
         assert is_drawn == (turn < 270 * abs(torque) / 2.0)
+
+
+def test_a_box_is_drawn_with_its_corners(show):
+    """Eight corners of 1.2 x 0.6 m: a pill within them would leave its corners free."""
+    data = pages.pendulum()
+    corners = [[x, y, z] for x in (-0.6, 0.6) for y in (-0.3, 0.3) for z in (-0.1, 0.1)]
+    data["player"]["parts"] = [{"points": corners, "radius": 0.0, "color": "#4d66cc"}]
+    for one in (one for policy in data["player"]["policies"] for one in policy["episodes"]):
+        still = pages.rod(0, 0, np.zeros(one["frames"]))
+        one |= {"parts": pages.packed(still * pages.INT16), "scale": 1 / pages.INT16}
+        one["series"]["torque [N m]"] = [0.0] * (one["frames"] - 1)
+    tab = show(data)
+    for x in (-0.57, 0.57):
+        for y in (-0.27, 0.27):
+            assert stage_pixel(tab, data, x, y) == (77, 102, 204)
+            assert stage_pixel(tab, data, 1.12 * x, 1.2 * y) != (77, 102, 204)
+
+
+def test_an_instant_has_one_value(show):
+    """Beside the map stands what the panel shows at that time, though the map is as coarse as its grid."""
+    data = pages.pendulum()
+    tab = show(data)
+    for frame in (0, 13, 40, 99):
+        scrub(tab, frame)
+        shown = data["player"]["policies"][1]["episodes"][0]["series"]["value"][frame]
+        words = f"{shown:.2f}".replace("-", "\u2212")
+        assert tab.inner_text(".map + .reading").endswith(f": value {words}")
+        assert tab.locator(".panels text.strong").last.text_content() == words
 
 
 def test_a_path_over_an_axis_that_wraps_does_not_cross_the_picture(show):
@@ -216,6 +244,64 @@ def test_curves_are_read_by_keyboard_and_by_pointing(show):
     assert first.get_attribute("aria-valuetext").startswith(read)
     first.hover()
     assert first.get_attribute("aria-valuenow") in ("11", "12", "13")
+
+
+def test_references_are_lines_where_there_is_room_and_words_elsewhere(show):
+    tab = show(pages.pendulum())
+    first = tab.locator(".curve").first
+    assert first.locator(".reference").count() == 1
+    assert "best possible \u2212137.4" in first.text_content()
+    assert tab.get_by_text("outside of the picture").inner_text().endswith("far away \u2212100,000")
+
+
+def test_the_head_says_what_the_policies_are_worth_and_the_foot_how_to_get_them(show):
+    tab = show(pages.pendulum(notes=["no workspace: there is none"]))
+    assert tab.locator(".facts + .scrolled td").first.inner_text() == "before training"
+    assert tab.inner_text(".remarks li") == "no workspace: there is none"
+    assert tab.inner_text("pre") == "python -m jaxpg.train env=pendulum env.mass=2.0"
+    assert tab.inner_text("summary >> nth=0") == "Configuration (3, 1 not the default)"
+    assert tab.locator(".differs").all_text_contents() == ["env.mass2.0 default 1.0"]
+
+
+@pytest.mark.parametrize("page_of", [pages.pendulum, pages.comparison])
+def test_on_a_phone_the_return_is_seen_without_scrolling(show, page_of):
+    tab = show(page_of())
+    tab.set_viewport_size({"width": 360, "height": 800})
+    table = tab.locator("table").first
+    header = table.locator("th").filter(has_text="return")
+    assert header.count() == 1
+    for cell in [header, table.locator("tbody tr:first-child td:nth-child(2)")]:
+        box = cell.bounding_box()
+        assert box["x"] + box["width"] <= 360
+
+
+def test_too_few_seeds_are_neither_bold_nor_shaded(show):
+    """Though each run of the one is better than each of the other."""
+    data = pages.comparison()
+    for row, column, p in [(0, 1, 1.0), (1, 0, 0.0)]:
+        data["improvement"]["probability"][row][column] = p
+        data["improvement"]["low"][row][column] = data["improvement"]["high"][row][column] = None
+    tab = show(data)
+    cell = tab.locator(".matrix tbody tr:nth-child(1) td").nth(1)
+    assert cell.inner_text().split("\n") == ["1.00", "too few seeds"]
+    assert cell.locator("b").count() == 0
+    assert cell.get_attribute("class") == "number"
+    sure = tab.locator(".matrix tbody tr:nth-child(1) td").nth(2)
+    assert sure.locator("b").count() == 1
+
+
+def test_a_part_that_fails_takes_nothing_else_with_it(tab_with, tmp_path):
+    data = pages.pendulum()
+    data["portrait"]["values"] = None
+    path = tmp_path / "broken.html"
+    path.write_text(page(data), encoding="utf-8")
+    tab = tab_with().page.context.new_page()
+    tab.goto(path.as_uri())
+    tab.wait_for_selector(".curve svg", state="attached")
+    assert "This part could not be drawn" in tab.locator("section").first.inner_text()
+    assert tab.locator("h2").all_inner_texts()[:2] == ["Rollout", "Learning"]
+    assert tab.locator("details").count() == 2
+    tab.close()
 
 
 def test_dark_differs_from_light_and_the_button_overrides(show):

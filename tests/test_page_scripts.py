@@ -4,6 +4,7 @@ import browsers
 import numpy as np
 import pages
 import pytest
+import scipy.spatial
 from browsers import computed
 
 
@@ -29,6 +30,29 @@ def test_ticks_are_round_even_and_within_the_range(tab):
         units = {"k": "e3", "M": "e6"}
         texts = [tick["text"].replace("\u2212", "-") for tick in ticks]
         np.testing.assert_allclose([float(t[:-1] + units.get(t[-1], t[-1])) for t in texts], values, atol=1e-12)
+
+
+@pytest.mark.parametrize("number", [3, 4, 8, 40])
+def test_an_outline_is_the_convex_hull(tab, number):
+    points = np.random.default_rng(number).normal(size=(number, 2))
+    corners = np.array(computed(tab, ["outline"], "hull(argument)", points.tolist()))
+    expected = points[scipy.spatial.ConvexHull(points).vertices]
+    np.testing.assert_allclose(corners[np.lexsort(corners.T)], expected[np.lexsort(expected.T)])
+
+
+def test_an_outline_of_one_point_two_or_equal_ones_is_those(tab):
+    assert computed(tab, ["outline"], "hull(argument)", [[1, 2]]) == [[1, 2], [1, 2]]
+    assert computed(tab, ["outline"], "hull(argument)", [[1, 2], [0, 1], [1, 2]]) == [[0, 1], [1, 2]]
+
+
+def test_a_map_is_read_between_its_points(tab):
+    """A bilinear function is reproduced exactly."""
+    x, y = np.meshgrid(np.arange(5.0), np.arange(4.0))
+    values = (1 + 2 * x - y + 0.5 * x * y).ravel().tolist()
+    for column, row in [(0, 0), (0.5, 0), (3.25, 2.5), (4, 3), (9, -1)]:
+        c, r = min(column, 4), max(row, 0)
+        found = computed(tab, ["numbers", "portrait"], f"bilinear(argument, 5, 4, {column}, {row})", values)
+        assert found == pytest.approx(1 + 2 * c - r + 0.5 * c * r)
 
 
 def test_the_colours_of_a_map_get_lighter_all_the_way(tab):

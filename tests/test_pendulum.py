@@ -26,6 +26,11 @@ def step(env, theta, theta_dot, action):
     return jax.jit(jax.vmap(env.step))(state, jnp.asarray(action, jnp.float32)[:, None])
 
 
+def test_what_is_best_is_known_of_gymnasiums_pendulum_alone(env):
+    assert env.references == envs.make("pendulum", physics="mujoco").references == {"best possible": -137.4}
+    assert envs.make("pendulum", physics="mujoco", mass=2.0).references == {}
+
+
 def test_steps_are_gymnasiums(env):
     """10,000 random states and actions, also beyond the torque limit and near the speed limit: to 1e-5."""
     random = np.random.default_rng(0)

@@ -18,6 +18,7 @@ from envs.quadratic import (
     lambda_targets,
     make,
     objective,
+    optimum,
     riccati_gains,
     state_moments,
     values,
@@ -196,3 +197,25 @@ def test_default_training_finds_the_best_gain():
     policy = Policy(K, k, 0.5)
     problem = chain(config.env)
     assert objective(problem, policy) / objective(problem, best_policy(problem, 0.5)) < 1.02
+
+
+@given(problems)
+@settings(max_examples=30, deadline=None)
+def test_the_optimum_is_what_its_gains_earn_step_by_step(problem):
+    """The moments of the states forwards in time, and the expected cost of each step; no constant policy earns more."""
+    mean, covariance, earned = problem.initial_mean, problem.initial_covariance, 0.0
+    for t, K in enumerate(riccati_gains(problem)):
+        second = covariance + np.outer(mean, mean)
+        closed = problem.A + problem.B @ K
+        following = closed @ second @ closed.T + problem.W
+        earned -= problem.discount**t * (np.trace(problem.Q @ following) + np.trace(problem.R @ K @ second @ K.T))
+        mean, covariance = closed @ mean, closed @ covariance @ closed.T + problem.W
+    best = optimum(problem)
+    np.testing.assert_allclose(best, earned, rtol=1e-9, atol=1e-12)
+    for seed in range(3):
+        assert objective(problem, random_policy(seed, problem)) <= best + 1e-9 * abs(best)
+
+
+def test_an_environment_knows_what_can_be_earned_at_best():
+    """s' = s + 0.1 a for one step from s = 0.5: -((0.5 + 0.1 a)^2 + 0.01 a^2) is the largest at a = -2.5."""
+    assert make(QuadraticConfig(episode_length=1)).references["best possible"] == pytest.approx(-(0.25**2 + 0.0625))

@@ -113,16 +113,21 @@ def test_the_policy_before_training_is_the_one_that_training_begins_with():
 # --- in the plane -----------------------------------------------------------------------------------------------------
 
 
+def ends(picture, frames):
+    """Of parts with two points each, `[F, P, 2, 2]`."""
+    return drawing.points(picture, frames).reshape(len(frames.place), -1, 2, 2)
+
+
 def test_a_pendulum_is_drawn_as_its_angle_says():
     """From the pivot to the tip, which is at (-sin theta, cos theta) seen against +y: positive angles lean left."""
     view = scene(a_policy(*PENDULUM).env)
     picture, theta = drawing.picture(view.model), np.linspace(-7, 7, 50)
-    ends = drawing.draw(picture, theta[:, None]).parts.reshape(50, 2, 2)
-    order = np.argsort(np.linalg.norm(ends, axis=-1), axis=1)
-    pivot, tip = (np.take_along_axis(ends, order[:, i, None, None], axis=1)[:, 0] for i in (0, 1))
+    rod = ends(picture, drawing.draw(picture, theta[:, None]))[:, 0]
+    order = np.argsort(np.linalg.norm(rod, axis=-1), axis=1)
+    pivot, tip = (np.take_along_axis(rod, order[:, i, None, None], axis=1)[:, 0] for i in (0, 1))
     np.testing.assert_allclose(pivot, 0, atol=1e-6)
     np.testing.assert_allclose(tip, np.stack([-np.sin(theta), np.cos(theta)], axis=1), atol=1e-6)
-    assert picture.radius == pytest.approx(0.05)
+    assert [part.radius for part in picture.parts] == pytest.approx([0.05])
     assert [(motor.command, motor.sign) for motor in picture.motors] == [(0, 1)]
 
 
@@ -131,13 +136,14 @@ def test_an_arm_is_drawn_as_its_angles_say_and_its_goal_where_it_is():
     view, upper, fore = scene(stored.env), *stored.env.lengths
     state = stored.env.reset(jax.random.key(5))
     qpos = np.array([[0.3, -1.2], [2.0, 0.5]])
-    frames = drawing.draw(drawing.picture(view.model), qpos, np.array(view.goal(state))[None])
+    picture = drawing.picture(view.model)
+    frames = drawing.draw(picture, qpos, np.array(view.goal(state))[None])
     shoulder, wrist = qpos[:, 0], qpos.sum(axis=1)
     elbow = upper * np.stack([np.cos(shoulder), np.sin(shoulder)], axis=1)
     hand = elbow + fore * np.stack([np.cos(wrist), np.sin(wrist)], axis=1)
-    ends = np.sort(frames.parts.reshape(2, 2, 2, 2), axis=2)  # of either rod, in whichever order
+    rods = np.sort(ends(picture, frames), axis=2)  # of either rod, in whichever order
     for rod, (a, b) in enumerate([(0 * elbow, elbow), (elbow, hand)]):
-        np.testing.assert_allclose(ends[:, rod], np.sort(np.stack([a, b], axis=1), axis=1), atol=1e-6)
+        np.testing.assert_allclose(rods[:, rod], np.sort(np.stack([a, b], axis=1), axis=1), atol=1e-6)
     np.testing.assert_allclose(frames.motors, np.stack([0 * elbow, elbow], axis=1), atol=1e-6)
     np.testing.assert_allclose(frames.goal, state.pipeline_state.goal, atol=1e-6)
 
@@ -146,7 +152,7 @@ def test_what_is_drawn_lies_in_its_rectangle():
     view = scene(a_policy(*ARM).env)
     picture = drawing.picture(view.model)
     frames = drawing.draw(picture, np.array([[0.0, 0.0], [np.pi / 2, 0.0]]), np.array([[-0.5, 0.2, 0.0]]))
-    x_min, y_min, x_max, y_max = drawing.extent([frames], picture.radius, margin=0.0)
+    x_min, y_min, x_max, y_max = drawing.extent(picture, [frames], margin=0.0)
     # Stretched along x, then along y, with the radius of the rods; and the goal on the other side.
     np.testing.assert_allclose([x_min, y_min, x_max, y_max], [-0.5, -0.03, 1.025, 1.025], atol=1e-6)
 
@@ -154,12 +160,11 @@ def test_what_is_drawn_lies_in_its_rectangle():
 def test_a_robot_that_travels_stays_in_the_picture():
     view = scene(a_policy(*ARM).env)
     picture = drawing.picture(view.model)
-    still = drawing.draw(picture, np.zeros((10, 2)))
-    away = np.linspace(0, 20, 10)[:, None, None, None] * np.array([1.0, 0.0])
-    travelling = still.parts.reshape(10, -1, 2, 2) + away
-    moved = travelling - drawing._place(travelling)[:, None, None]
-    assert np.ptp(moved[..., 0]) == pytest.approx(np.ptp(still.parts.reshape(10, -1, 2, 2)[..., 0]))
-    assert not drawing._place(still.parts.reshape(10, -1, 2, 2)).any()
+    still = drawing.points(picture, drawing.draw(picture, np.zeros((10, 2))))
+    travelling = still + np.linspace(0, 20, 10)[:, None, None] * np.array([1.0, 0.0])
+    moved = travelling - drawing.followed(travelling)[:, None]
+    assert np.ptp(moved[..., 0]) == pytest.approx(np.ptp(still[..., 0]))
+    assert not drawing.followed(still).any()
 
 
 # --- the phase plane --------------------------------------------------------------------------------------------------

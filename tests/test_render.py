@@ -8,6 +8,7 @@ import subprocess
 import sys
 from fractions import Fraction
 
+import mujoco
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -133,6 +134,22 @@ def test_the_goal_is_where_it_is_and_as_large(goal, draw):
     place, unit = pixel(ARM, goal)
     np.testing.assert_allclose(where(mask).mean(axis=0), place, atol=0.7)
     assert math.sqrt(mask.sum() / math.pi) == pytest.approx(unit * scene(a_policy(*ARM).env).goal_radius, abs=0.7)
+
+
+@pytest.mark.parametrize(
+    "geoms",
+    ['<geom size=".3" group="3"/>', '<inertial pos="0 0 0" mass="1" diaginertia=".1 .1 .1"/>'],
+    ids=["group 3", "no geoms"],
+)
+def test_a_robot_without_visible_geoms_is_seen_all_the_same(geoms, backend):
+    from jaxpg.watch.canvas import Canvas, Cell
+
+    body = f'<body><joint type="hinge"/>{geoms}</body><geom type="plane" size="9 9 1" pos="0 0 -9"/>'
+    model = mujoco.MjModel.from_xml_string(f"<mujoco><worldbody>{body}</worldbody></mujoco>")
+    with Canvas(model, backend, (1, 1), (SIZE, SIZE)) as canvas:
+        image = canvas.draw([Cell(np.zeros(1), None, np.zeros(0), "")]).astype(int)
+    middle = image[SIZE // 2 - 5 : SIZE // 2 + 5, SIZE // 2 - 5 : SIZE // 2 + 5]
+    assert changed(middle, np.broadcast_to(image[5, 5], middle.shape)).all()
 
 
 @pytest.mark.parametrize("theta", [0.0, 1.0, -2.2])

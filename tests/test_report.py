@@ -50,7 +50,9 @@ def test_a_finished_run_has_its_page(run):
     folder, output, data = run("pendulum")
     assert f"{folder / 'report.html'}: " in output
     assert data["title"] == "ppo on pendulum, seed 0"
-    assert ["env.episode_length", "12"] in data["configuration"]
+    assert ["env.episode_length", "12", "200"] in data["configuration"]
+    assert ["algo.gamma", "0.995", None] in data["configuration"]
+    assert data["notes"] == []
     assert dict(data["versions"])["jax"]
 
 
@@ -68,9 +70,10 @@ def test_the_best_policy_earns_what_its_evaluation_said(run):
     """The page plays the starts of the evaluations: of the deterministic policy it has the same return."""
     folder, _, data = run("pendulum")
     best = max(line["eval_return"] for line in read_metrics(RunFolder(folder)))
-    said = dict(data["facts"])["return, best"]
+    said = {row[0]: row[1] for row in data["head"]["rows"]}["best"]
     assert float(said.split(" ±")[0]) == pytest.approx(best, abs=0.06)
-    assert said.endswith("over 8 episodes")
+    assert "over the episodes of an evaluation" in data["head"]["note"]
+    assert not [text for _, text in data["facts"] if "best" in text]  # nothing else is called so
     returns = [episode["return"] for episode in data["player"]["policies"][1]["episodes"]]
     assert len(returns) == 6
 
@@ -80,10 +83,10 @@ def test_every_policy_plays_from_the_same_starts(run):
     player = data["player"]
     assert [policy["label"] for policy in player["policies"]][:2] == ["before training", "best"]
     for episodes in zip(*(policy["episodes"] for policy in player["policies"]), strict=True):
-        first = [unpacked(one["parts"], one["frames"], 1, 4)[0, 0] * one["scale"] for one in episodes]
+        first = [unpacked(one["parts"], one["frames"], 1, 8)[0, 0] * one["scale"] for one in episodes]
         for other in first[1:]:
             np.testing.assert_allclose(other, first[0], atol=1e-3)
-    last = [unpacked(one["parts"], 13, 1, 4)[-1, 0] * one["scale"] for one in episodes]
+    last = [unpacked(one["parts"], 13, 1, 8)[-1, 0] * one["scale"] for one in episodes]
     assert np.abs(last[0] - last[1]).max() > 1e-3  # and not to the same end
 
 

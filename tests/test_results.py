@@ -22,10 +22,17 @@ def test_settings_are_in_order_of_the_interquartile_mean_of_the_last_evaluation(
     """That with a seed that diverged is the last, however good the others are."""
     rows = table(CONFIG, LINES)
     assert list(rows) == ["algo.gamma=1.0", "algo.gamma=0.5", "algo.gamma=0.75"]
-    low, high = bootstrap_interval(np.array(LAST[8:]))
-    assert rows["algo.gamma=1.0"] == f"{interquartile_mean(np.array(LAST[8:])):.1f} [{low:.1f}, {high:.1f}]"
+    assert rows["algo.gamma=1.0"] == f"{interquartile_mean(np.array(LAST[8:])):.1f} (2.0 to 100.0)"
     assert rows["algo.gamma=0.75"] == "n/a"
-    assert "interquartile mean of 4 seeds" in heading(CONFIG)
+    assert "interquartile mean of 4 seeds (lowest to highest)" in heading(CONFIG)
+
+
+def test_enough_seeds_have_an_interval():
+    values = [float(i) for i in range(8)]
+    low, high = bootstrap_interval(np.array(values))
+    config = compose(["num_seeds=8", "sweep.algo.gamma=[0.5]"])
+    assert table(config, [{"eval_return": values}]) == {"algo.gamma=0.5": f"3.5 [{low:.1f}, {high:.1f}]"}
+    assert "interquartile mean of 8 seeds [95 % interval]" in heading(config)
 
 
 def test_a_setting_with_one_seed_has_no_interval():

@@ -2,6 +2,7 @@
 
 import io
 import os
+import re
 import subprocess
 import sys
 import time
@@ -35,6 +36,19 @@ def test_evaluations_are_shown_as_lines_that_stay(display):
     lines = [line for line in written.getvalue().splitlines() if "deterministic -2.5" in line]
     assert len(lines) == 1
     assert "50 steps" in lines[0]
+
+
+@pytest.mark.parametrize("num_agents", [1, 4])
+def test_the_rate_counts_the_steps_of_all_agents(num_agents, monkeypatch, capsys):
+    """1,000 of 5,000 steps of each agent in 2 s: 500 steps/s an agent, and 8 s are left, however many there are."""
+    now = iter([10.0, 10.0, 12.0])
+    monkeypatch.setattr(terminal.time, "monotonic", lambda: next(now))
+    display = terminal.Display(5000, num_agents=num_agents)
+    display.start()
+    display.update({"steps": 1000, "return": -1.0, "eval_return": -2.0})
+    said = capsys.readouterr().out
+    assert int(re.search(r"([\d,]+) steps/s", said)[1].replace(",", "")) == 500 * num_agents
+    assert "8 s left" in said
 
 
 def test_what_takes_its_time_is_named_with_a_clock_or_in_a_line(display):

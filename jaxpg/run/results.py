@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from jaxpg.run.config import Config
-from jaxpg.run.statistics import bootstrap_interval, interquartile_mean
+from jaxpg.run.statistics import has_interval, interquartile_mean, spread, spread_name
 from jaxpg.run.sweep import described, settings
 
 Lines = Sequence[dict[str, Any]]
@@ -46,7 +46,8 @@ def heading(config: Config) -> str:
     """What the table shows."""
     number, seeds = len(settings(config.sweep)), config.run.num_seeds
     which = f"the best {SHOWN} of {number} settings" if number > SHOWN else "settings, the best first"
-    of = f"interquartile mean of {seeds} seeds [95 % interval]" if seeds > 1 else f"seed {config.run.seed}"
+    around = f"[{spread_name(seeds)}]" if has_interval(seeds) else f"({spread_name(seeds)})"
+    of = f"interquartile mean of {seeds} seeds {around}" if seeds > 1 else f"seed {config.run.seed}"
     return f"{which}; return of the last evaluation, {of}:"
 
 
@@ -63,13 +64,16 @@ def curves(config: Config, lines: Lines) -> dict[str, slice]:
 
 
 def score(values: np.ndarray) -> str:
-    """Returns of the seeds for people: their interquartile mean and its 95 % interval; n/a where one is not finite.
+    """Values of the seeds for people: their interquartile mean and its 95 % interval; n/a where one is not finite.
 
-    >>> score(np.array([-2.0])), score(np.array([5.0, 5.0])), score(np.array([np.nan, 5.0]))
-    ('-2.0', '5.0 [5.0, 5.0]', 'n/a')
+    Too few seeds carry no interval: then their lowest and highest value follow, in parentheses.
+
+    >>> score(np.array([-2.0])), score(np.array([5.0, 7.0])), score(np.full(6, 5.0)), score(np.array([np.nan, 5.0]))
+    ('-2.0', '6.0 (5.0 to 7.0)', '5.0 [5.0, 5.0]', 'n/a')
     """
     if not np.isfinite(values).all():
         return "n/a"
-    mean = f"{interquartile_mean(values):.1f}"
-    low, high = bootstrap_interval(values)
-    return f"{mean} [{low:.1f}, {high:.1f}]" if len(values) > 1 else mean
+    mean, (low, high) = f"{interquartile_mean(values):.1f}", spread(values)
+    if len(values) == 1:
+        return mean
+    return f"{mean} [{low:.1f}, {high:.1f}]" if has_interval(len(values)) else f"{mean} ({low:.1f} to {high:.1f})"

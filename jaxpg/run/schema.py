@@ -241,7 +241,7 @@ class ReportOptions:
 class CompareOptions:
     """Options of the comparison."""
 
-    out: str = option("comparison.html", "the page to write")
+    out: str = option("comparison.html", "the page, figure or table to write: .html, .pdf, .svg or .csv")
 
 
 @dataclass(frozen=True)

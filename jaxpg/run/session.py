@@ -18,6 +18,7 @@ from envs.base import interface
 from jaxpg.divergence import BOUND
 from jaxpg.run import agents, figures, folder, lock, memory, registered, results, same_run, versions
 from jaxpg.run import config as configuration
+from jaxpg.run.attempts import attempt
 from jaxpg.run.cache import compilation_cache, physics_cache, timed
 from jaxpg.run.chunks import PATIENCE, Watch, summary
 from jaxpg.run.config import Config
@@ -74,7 +75,7 @@ def _begin(config: Config, env: Any, run_folder: RunFolder) -> int:
     schedule, run = plan(config), config.run
     folder.write_versions(run_folder)
     folder.replace(run_folder.config, configuration.to_yaml(config))
-    display = Display(schedule.total_steps)
+    display = Display(schedule.total_steps, num_agents=config.num_agents)
     display.say(
         f"{agents.described(config)}: {run.num_envs} environments x {run.num_steps} steps x "
         f"{schedule.num_updates:,} updates = {schedule.total_steps:,} steps, into {run_folder.path}"
@@ -144,7 +145,7 @@ def _go_on(stored: Config, config: Config, run_folder: RunFolder) -> int:
     update, problems = checkpoints.newest_sound()
     same_run.check_checkpoint(checkpoints, update, config)
     schedule = plan(config)
-    display = Display(schedule.total_steps, steps=update * schedule.steps_per_update)
+    display = Display(schedule.total_steps, update * schedule.steps_per_update, config.num_agents)
     for problem in problems:
         display.say(f"note: {problem}; the one before it is used")
     session = Session(config, schedule, run_folder, display)
@@ -285,13 +286,15 @@ def _show_results(session: Session, rate: float, compile_seconds: float, trainin
 
 
 def _write_report(session: Session) -> None:
-    """The page of the run; a disk that is full costs no more than the page."""
+    """The page of the run."""
     from jaxpg.watch import report
 
-    try:
-        report.of_run(str(session.run_folder.path), None, session.config.run.cache, session.display.say)
-    except UserError as error:
-        session.display.say(f"note: no report: {error}")
+    path, cache, say = str(session.run_folder.path), session.config.run.cache, session.display.say
+    attempt("report", lambda: report.of_run(path, None, cache, say), _noting(session))
+
+
+def _noting(session: Session) -> Callable[[str], None]:
+    return lambda line: session.display.say(f"note: {line}")
 
 
 def _update(train: TrainState) -> int:
@@ -305,19 +308,19 @@ def _side_by_side(train: TrainState) -> TrainState:
 
 
 def _draw(session: Session) -> list[dict[str, Any]]:
-    """Draws the learning curve, if it can be written; returns the lines of metrics that it shows."""
-    config, run_folder = session.config, session.run_folder
-    lines, title = folder.read_metrics(run_folder, config.num_agents), agents.described(config)
-    picture = io.BytesIO()
+    """Draws the learning curve, if it can be drawn; returns the lines of metrics that it shows."""
+    lines = folder.read_metrics(session.run_folder, session.config.num_agents)
+    attempt("learning curve", lambda: _draw_curve(session, lines), _noting(session))
+    return lines
+
+
+def _draw_curve(session: Session, lines: list[dict[str, Any]]) -> None:
+    config, title, picture = session.config, agents.described(session.config), io.BytesIO()
     if config.sweep:
         figures.sweep_curves(lines, picture, title, results.curves(config, lines))
     else:
         figures.learning_curve(lines, picture, title)
-    try:
-        folder.replace(run_folder.learning_curve, picture.getvalue())
-    except UserError as error:
-        session.display.say(f"note: {error}")
-    return lines
+    folder.replace(session.run_folder.learning_curve, picture.getvalue())
 
 
 def _evaluate(program: Program, state: RunState) -> tuple[RunState, dict[str, Any]]:
@@ -358,7 +361,7 @@ def _closing_rows(
         rows["diverged"] = f"{exploded:,.0f} episodes of the last evaluation"
     if "eval_success" in last:
         success = finite_mean(np.array(last["eval_success"], float))
-        rows["success"] = f"{success:.1%} at the end"
+        rows["success"] = f"{success:.1%} at the end" if np.isfinite(success) else "n/a"
     return rows | {
         "speed": f"{rate:,.0f} steps/s",
         "time": f"{compile_seconds:.1f} s compiling, {training_seconds:.1f} s training",

@@ -1,8 +1,30 @@
-"""Aggregates over episodes and over seeds: means, the interquartile mean, the probability of improvement, intervals."""
+"""Aggregates over episodes and over seeds: means, the interquartile mean, the probability of improvement, intervals.
+
+An interval is only given where there are seeds enough to carry one.
+"""
 
 from __future__ import annotations
 
+import math
+import statistics
+
 import numpy as np
+
+CONFIDENCE = 0.95
+
+
+def fewest_seeds(confidence: float = CONFIDENCE) -> int:
+    """How many seeds a bootstrap interval needs.
+
+        P(min < centre < max) = 1 - 2^(1 - S),    of S independent values about their median
+
+    A bootstrap interval lies within the values that it is made of, so with fewer it cannot have its confidence, however
+    they have come out: one value gives a point, which always looks certain.
+
+    >>> fewest_seeds(0.95), fewest_seeds(0.5)
+    (6, 2)
+    """
+    return math.ceil(1 - math.log2(1 - confidence) - 1e-9)
 
 
 def counted_returns(episode_return: np.ndarray, diverged: np.ndarray) -> np.ndarray:
@@ -65,7 +87,7 @@ def interquartile_mean(scores: np.ndarray) -> np.ndarray:
 
 
 def bootstrap_interval(
-    scores: np.ndarray, confidence: float = 0.95, resamples: int = 2000, seed: int = 0
+    scores: np.ndarray, confidence: float = CONFIDENCE, resamples: int = 2000, seed: int = 0
 ) -> tuple[np.ndarray, np.ndarray]:
     """Percentile bootstrap interval of the interquartile mean, resampling the seeds.
 
@@ -76,13 +98,43 @@ def bootstrap_interval(
       seed: of the resampling.
 
     Returns:
-      Lower and upper end, `[...]` each.
+      Lower and upper end, `[...]` each; NaN of fewer than `fewest_seeds(confidence)`.
 
     Source: Efron, Annals of Statistics 7 (1979).
     """
     scores = np.asarray(scores, float)
+    if len(scores) < fewest_seeds(confidence):
+        return np.full(scores.shape[1:], np.nan), np.full(scores.shape[1:], np.nan)
     draws = np.random.default_rng(seed).integers(len(scores), size=(resamples, len(scores)))
-    return _middle(np.stack([interquartile_mean(scores[draw]) for draw in draws]), confidence)
+    means, tail = np.stack([interquartile_mean(scores[draw]) for draw in draws]), (1 - confidence) / 2
+    return np.quantile(means, tail, axis=0), np.quantile(means, 1 - tail, axis=0)
+
+
+def spread(scores: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """What is drawn and written around an interquartile mean, as `spread_name` calls it.
+
+    Args:
+      scores: one row for each seed, `[S, ...]`.
+
+    Returns:
+      Lower and upper end, `[...]` each: the bootstrap interval; of too few seeds their lowest and highest score.
+    """
+    scores = np.asarray(scores, float)
+    return bootstrap_interval(scores) if has_interval(len(scores)) else (scores.min(axis=0), scores.max(axis=0))
+
+
+def has_interval(number: int) -> bool:
+    """Whether so many seeds carry an interval of the usual confidence."""
+    return number >= fewest_seeds()
+
+
+def spread_name(number: int) -> str:
+    """What `spread` of so many seeds is.
+
+    >>> spread_name(3), spread_name(10)
+    ('lowest to highest', '95 % interval')
+    """
+    return f"{100 * CONFIDENCE:.0f} % interval" if has_interval(number) else "lowest to highest"
 
 
 def probability_of_improvement(x: np.ndarray, y: np.ndarray) -> float:
@@ -102,25 +154,39 @@ def probability_of_improvement(x: np.ndarray, y: np.ndarray) -> float:
     return float(np.mean((np.sign(difference) + 1) / 2))
 
 
-def improvement_interval(
-    x: np.ndarray, y: np.ndarray, confidence: float = 0.95, resamples: int = 2000, seed: int = 0
-) -> tuple[float, float]:
-    """Percentile bootstrap interval of `probability_of_improvement`, resampling the seeds of X and of Y.
+def improvement_interval(x: np.ndarray, y: np.ndarray, confidence: float = CONFIDENCE) -> tuple[float, float]:
+    """Interval of `probability_of_improvement`: the values of P that lie within z standard errors of the one found.
+
+        |P - P_found| = z sqrt(V(P)),    V(P) = P (1 - P) (1 + M (1 - P) / (2 - P) + M P / (1 + P)) / (S R)
+        M = (S + R) / 2 - 1,    z: the normal distribution's quantile at (1 + confidence) / 2
+
+    Other than a bootstrap it is no point where all of X are better than all of Y.
 
     Args:
-      x, y, confidence, resamples, seed: as above.
+      x, y: a score for each seed, `[S]` and `[R]`.
+      confidence: probability that the interval is meant to have.
 
     Returns:
-      Lower and upper end.
+      Lower and upper end; NaN where the seeds are too few for any outcome to leave out one half: where the smallest
+      two-sided probability of the rank test, 2 / C(S + R, S), is more than 1 - confidence, or where one is alone.
+
+    Source: Newcombe, Statistics in Medicine 25 (2006), method 5.
+
+    >>> [round(end, 2) for end in improvement_interval(np.arange(10.0) + 20, np.arange(10.0))]
+    [0.8, 1.0]
     """
-    x, y, generator = np.asarray(x, float), np.asarray(y, float), np.random.default_rng(seed)
-    picks = [generator.integers(len(z), size=(resamples, len(z))) for z in (x, y)]
-    draws = [probability_of_improvement(x[i], y[j]) for i, j in zip(*picks, strict=True)]
-    low, high = _middle(np.array(draws), confidence)
-    return float(low), float(high)
+    if min(len(x), len(y)) < 2 or 2 / math.comb(len(x) + len(y), len(x)) > 1 - confidence:
+        return math.nan, math.nan
+    found = probability_of_improvement(x, y)
+    return 1 - _upper_end(1 - found, len(x), len(y), confidence), _upper_end(found, len(x), len(y), confidence)
 
 
-def _middle(draws: np.ndarray, confidence: float) -> tuple[np.ndarray, np.ndarray]:
-    """The ends of the interval that holds the middle part of the draws, `[resamples, ...]`."""
-    tail = (1 - confidence) / 2
-    return np.quantile(draws, tail, axis=0), np.quantile(draws, 1 - tail, axis=0)
+def _upper_end(found: float, S: int, R: int, confidence: float) -> float:
+    """The P above the one found that is z standard errors away from it: by bisection, as z V^(1/2) falls short at 1."""
+    z, low, high = statistics.NormalDist().inv_cdf((1 + confidence) / 2), found, 1.0
+    for _ in range(60):
+        P = (low + high) / 2
+        M = (S + R) / 2 - 1
+        variance = P * (1 - P) * (1 + M * (1 - P) / (2 - P) + M * P / (1 + P)) / (S * R)
+        low, high = (P, high) if P - found < z * math.sqrt(variance) else (low, P)
+    return high

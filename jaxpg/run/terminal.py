@@ -20,11 +20,11 @@ from rich.progress import (
 
 
 class Display:
-    """Progress of a run of `total_steps` environment steps, `steps` of which are done."""
+    """Progress of a run of `total_steps` environment steps of each of its agents, `steps` of which are done."""
 
-    def __init__(self, total_steps: int, steps: int = 0):
+    def __init__(self, total_steps: int, steps: int = 0, num_agents: int = 1):
         self.console = Console(highlight=False, soft_wrap=True)
-        self._total = total_steps
+        self._total, self._num_agents = total_steps, num_agents
         self._first_steps, self._began = steps, time.monotonic()
         self._bar = None
         if self.console.is_terminal:
@@ -57,7 +57,7 @@ class Display:
         """Shows a line of metrics: on a terminal each on the bar, and those with an evaluation as text that stays."""
         seconds = time.monotonic() - self._began
         rate = (line["steps"] - self._first_steps) / max(seconds, 1e-9)
-        text = f"{rate:,.0f} steps/s  return {shown(line.get('return'))}"
+        text = f"{rate * self._num_agents:,.0f} steps/s  return {shown(line.get('return'))}"
         if self._bar:
             self._bar.update(self._task, completed=line["steps"], description=text)
         if "eval_return" in line:

@@ -12,6 +12,7 @@ import mujoco
 import numpy as np
 
 from jaxpg.watch import gl
+from jaxpg.watch.drawing import drawn_geoms
 
 GOAL = (0.1, 0.6, 0.25, 0.5)
 POSITIVE = (0.95, 0.55, 0.05, 1.0)  # efforts, which turn right-handed about the axis or push along it
@@ -59,7 +60,7 @@ class Canvas:
         self._data = mujoco.MjData(self._model)
         self._motors = _motors(self._model)
         self._gl = gl.context(backend, self.columns * width, self.rows * height)
-        self._scene, self._options = mujoco.MjvScene(self._model, maxgeom=10_000), mujoco.MjvOption()
+        self._scene, self._options = mujoco.MjvScene(self._model, maxgeom=10_000), _options(self._model)
         self._scene.flags[mujoco.mjtRndFlag.mjRND_SHADOW] = False  # on a CPU they take most of the time
         self._context = mujoco.MjrContext(self._model, mujoco.mjtFontScale.mjFONTSCALE_100)
         mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN, self._context)
@@ -115,6 +116,14 @@ def _prepared(model: Any, width: int, height: int, ratio: float) -> Any:
         model.vis.global_.fovy = _widened(model.vis.global_.fovy, ratio)
         model.cam_fovy[:] = _widened(model.cam_fovy, ratio)
     return model
+
+
+def _options(model: Any) -> Any:
+    """Of a model without visible geoms all are drawn, and of one without any the inertias of its bodies."""
+    options, geoms = mujoco.MjvOption(), drawn_geoms(model)
+    options.geomgroup[np.minimum(model.geom_group[geoms], len(options.geomgroup) - 1)] = 1
+    options.flags[mujoco.mjtVisFlag.mjVIS_INERTIA] = not geoms
+    return options
 
 
 def _widened(fovy: Any, ratio: float) -> Any:

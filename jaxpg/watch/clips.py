@@ -11,6 +11,8 @@ import numpy as np
 from jaxpg.run.policies import StoredPolicy
 from jaxpg.watch.recording import Look, Recording
 
+STEPS = ("reward", "value")  # series of every episode
+
 
 class Clip(NamedTuple):
     """F frames of an episode.
@@ -21,7 +23,7 @@ class Clip(NamedTuple):
       so_far: rewards before each frame, summed, `[F]`; those too of the steps between two frames.
       dt: between two frames [s]; the last may come sooner.
       episode_return: of the whole episode, undiscounted.
-      success: whether it has ended in success; None where the environment does not say.
+      success: whether it has ended in success; None where the environment does not say, or says no number.
     """
 
     look: Look
@@ -45,17 +47,39 @@ def clip(stored: StoredPolicy, recording: Recording, episode: int, most: int | N
     length = int(recording.length[episode])
     every = math.ceil(len(recording.reward) / most) if most else 1
     steps = frames(length, every)
-    of_steps = {"reward": recording.reward, "value": recording.value}
-    commands = {name: recording.command[..., i] for i, name in enumerate(stored.interface.commands)}
+    of_steps = dict(zip(STEPS, (recording.reward, recording.value), strict=True))
+    commands = {name: recording.command[..., i] for i, name in enumerate(command_names(stored))}
     success = recording.metrics.get("success")
+    ended = np.nan if success is None else float(success[length - 1, episode])
     return Clip(
         look=jax.tree.map(lambda x: x[steps, episode], recording.look),
         series={name: x[steps[:-1], episode] for name, x in (commands | of_steps).items()},
         so_far=np.append(0.0, np.cumsum(recording.reward[:length, episode], dtype=np.float64))[steps],
         dt=every * float(stored.env.dt),
         episode_return=float(recording.episode_return[episode]),
-        success=None if success is None else bool(success[length - 1, episode] > 0),
+        success=ended > 0 if np.isfinite(ended) else None,
     )
+
+
+def command_names(stored: StoredPolicy) -> list[str]:
+    """A name for each command that no other series of an episode has; numbers where the environment has not as many.
+
+    Where two are the same, each has its number after it.
+    """
+    size, names = stored.env.action_size, [str(name) for name in stored.interface.commands]
+    if len(names) != size:
+        names = [f"action {i + 1}" for i in range(size)]
+    numbered = [f"{name} ({i + 1})" for i, name in enumerate(names)]
+    distinct = [
+        by if names.count(name) > 1 or name in STEPS else name for name, by in zip(names, numbered, strict=True)
+    ]
+    return distinct if len(set(distinct)) == size else numbered
+
+
+def limits_of(stored: StoredPolicy) -> np.ndarray:
+    """The limit of each command, `[m]`; 1 where they have none, as actions lie within -1 and 1."""
+    limits = stored.interface.limits
+    return np.ones(stored.env.action_size) if limits is None else np.asarray(limits, float)
 
 
 def frames(last: int, every: int) -> list[int]:

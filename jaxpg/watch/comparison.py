@@ -1,191 +1,133 @@
-"""The page of several runs: which method is better, and how sure that is.
-
-A method is all options that training depends on but the seed. Agents of the same method, whichever runs they are of,
-are its seeds; each setting of a sweep is a method of its own.
-"""
+"""Several runs side by side, as a page, a figure or a table: which method is better, and how sure that is."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
-import numpy as np
-
-from jaxpg.run import config as configuration
 from jaxpg.run import folder, results
-from jaxpg.run.agents import alone
 from jaxpg.run.errors import UserError
-from jaxpg.run.statistics import improvement_interval, interquartile_mean, probability_of_improvement
+from jaxpg.run.statistics import (
+    fewest_seeds,
+    has_interval,
+    improvement_interval,
+    probability_of_improvement,
+    spread_name,
+)
+from jaxpg.watch import publication
 from jaxpg.watch.curves import PANELS, curve, finite
+from jaxpg.watch.methods import SAME_METHOD, Method, compared_at, methods, standings, task
 from jaxpg.watch.page import page
 
 Json = dict[str, Any]
-# What does not make another method: how much is looked at, written and waited for, and who draws the numbers.
-SAME_METHOD = {"seed", "num_seeds", "vmap_seeds", "run_dir", "cache", "report", "loggers", "total_steps"}
-SAME_METHOD |= {"log_interval", "eval_interval", "eval_episodes", "checkpoint_interval", "stop_return", "stop_agents"}
 MOST = 10  # methods with a colour of their own
-COLUMNS = ["method", "seeds", "environment steps", "return", "success rate"]
-
-
-class Agent(NamedTuple):
-    """One agent of a run.
-
-    Attributes:
-      options: all of them, by name.
-      seed: its own.
-      curves: metric -> {steps: value}, of its evaluations.
-    """
-
-    options: dict[str, Any]
-    seed: int
-    curves: dict[str, dict[int, float]]
-
-
-class Method(NamedTuple):
-    """Agents that differ in their seeds only.
-
-    Attributes:
-      label: what distinguishes it from the others.
-      agents: at least one.
-    """
-
-    label: str
-    agents: list[Agent]
-
-    def values(self, metric: str) -> tuple[np.ndarray, np.ndarray]:
-        """Steps `[K]` at which all agents have this metric, and its values `[S, K]`."""
-        found = [agent.curves.get(metric, {}) for agent in self.agents]
-        steps = sorted(set.intersection(*(set(values) for values in found)))
-        return np.array(steps), np.array([[values[step] for step in steps] for values in found])
-
-    @property
-    def scores(self) -> np.ndarray:
-        """The last return that all agents have, `[S]`."""
-        return self.values("eval_return")[1][:, -1]
+COLUMNS = ["method", "return", "success rate", "seeds", "environment steps"]
 
 
 def write(paths: Sequence[str], out: Path, say: Callable[[str], None]) -> None:
-    """Writes the page of these run folders, and says what its table says.
+    """Writes these run folders side by side, in the form that the ending of `out` says, and says what the table says.
 
     Raises:
-      UserError: as `methods`; or the page cannot be written.
+      UserError: as `methods`; another ending; or the file cannot be written.
     """
+    form = _form(out)
     found = methods(paths)
-    folder.replace(out, page(comparison(found)))
-    rows = [COLUMNS, *table(found)]
-    widths = [max(len(row[i]) for row in rows if i < len(row)) for i in range(len(rows[1]))]
+    folder.replace(out, form(found))
+    rows = [columns(found), *table(found)]
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
     for row in rows:
-        say("  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=False)).rstrip())
+        say("  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip())
+    for line in notes(found):
+        say(f"note: {line}")
     say(str(out))
 
 
-def methods(paths: Sequence[str]) -> list[Method]:
-    """The methods of these run folders, that with the best interquartile mean at its end first.
-
-    Raises:
-      UserError: no run folder, runs of different environments, a run twice, or one that has not been evaluated.
-    """
-    agents = [agent for path in paths for agent in _agents(path)]
-    tasks = sorted({_task(agent) for agent in agents})
-    if len(tasks) > 1:
-        raise UserError(f"runs of {' and '.join(tasks)}: only returns of the same environment can be compared")
-    groups: dict[str, list[Agent]] = {}
-    for agent in agents:
-        groups.setdefault(repr({k: v for k, v in agent.options.items() if k not in SAME_METHOD}), []).append(agent)
-    labels = _labels([group[0].options for group in groups.values()])
-    found = [Method(label, group) for label, group in zip(labels, groups.values(), strict=True)]
-    for method in found:
-        _check(method)
-    return sorted(found, key=lambda method: -float(interquartile_mean(method.scores)))
-
-
-def _task(agent: Agent) -> str:
-    return agent.options.get("env.name", agent.options["env"])
-
-
-def _agents(path: str) -> Iterator[Agent]:
-    run_folder = folder.find(path)
-    config = configuration.load(run_folder.config)
-    lines = folder.read_metrics(run_folder, config.num_agents)
-    for i in range(config.num_agents):
-        own = alone(config, i)
-        curves = {
-            metric: {line["steps"]: value for line in lines for value in _of_agent(line, metric, i)}
-            for metric in PANELS
-        }
-        yield Agent(configuration.named(own), own.run.seed, curves)
-
-
-def _of_agent(line: Json, metric: str, agent: int) -> Iterator[float]:
-    """The agent's value in a line of metrics, if it is there and finite."""
-    value = np.atleast_1d(np.array(line.get(metric), float))
-    if len(value) > agent and np.isfinite(value[agent]):
-        yield float(value[agent])
-
-
-def _labels(options: Sequence[Mapping[str, Any]]) -> list[str]:
-    """As few options as tell each from all others, the groups' members first; of a single one its algorithm."""
-    names = dict.fromkeys(name for one in options for name in one if name not in SAME_METHOD)
-    names = sorted(names, key=lambda name: "." in name)
-    chosen: list[str] = []
-    for name in names:
-        if _kinds(options, [*chosen, name]) > _kinds(options, chosen):
-            chosen.append(name)
-    chosen = chosen or ["algo"]
-    return [" ".join(f"{name}={one[name]}" for name in chosen if name in one) for one in options]
-
-
-def _kinds(options: Sequence[Mapping[str, Any]], names: Sequence[str]) -> int:
-    """How many of the options differ, as far as these names say."""
-    return len({tuple(repr(one.get(name)) for name in names) for one in options})
-
-
-def _check(method: Method) -> None:
-    seeds = [agent.seed for agent in method.agents]
-    twice = sorted({seed for seed in seeds if seeds.count(seed) > 1})
-    if twice:
-        raise UserError(f"{method.label}: seed {twice[0]} is there twice; a run counts once")
-    if not method.values("eval_return")[0].size:
-        raise UserError(f"{method.label}: no evaluation that all its runs have made")
+def _form(out: Path) -> Callable[[Sequence[Method]], str | bytes]:
+    """What writes methods down as the ending says."""
+    forms: dict[str, Callable[[Sequence[Method]], str | bytes]] = {
+        ".html": lambda found: page(comparison(found)),
+        ".pdf": lambda found: publication.figure(found, "pdf"),
+        ".svg": lambda found: publication.figure(found, "svg"),
+        ".csv": publication.csv_table,
+    }
+    if out.suffix.lower() not in forms:
+        raise UserError(f"out={out}: must end in {', '.join(forms)}: a page, a figure or a table")
+    return forms[out.suffix.lower()]
 
 
 def comparison(found: Sequence[Method]) -> Json:
     """What the page shows of some methods, as plain values."""
-    shown = found[:MOST]
-    task, rows = _task(found[0].agents[0]), table(found)
+    shown, whose = found[:MOST], f"{len(found)} methods" if len(found) > 1 else found[0].label
+    rows = [{"title": "methods, the best first", "columns": columns(found), "rows": table(found), "note": None}]
     data = {
         "kind": "comparison",
-        "title": f"{len(found)} methods on {task}" if len(found) > 1 else f"{found[0].label} on {task}",
-        "facts": [["score", "return of the last evaluation that all seeds of a method have"]],
+        "title": f"{whose} on {task(found[0].agents[0])}",
+        "facts": [["score", f"return of the evaluation at {compared_at(found):,} environment steps"]],
+        "head": None,
+        "notes": notes(found),
         "curves": [panel for panel in (_panel(shown, *metric) for metric in PANELS.items()) if panel["series"]],
-        "tables": [{"title": "methods, the best first", "columns": COLUMNS[: len(rows[0])], "rows": rows}],
+        "diagnostics": [],
+        "tables": rows,
         "improvement": improvement(shown) if len(shown) > 1 else None,
-        **{"player": None, "portrait": None, "workspace": None},
+        **{"player": None, "portrait": None, "workspace": None, "command": None},
         "configuration": _common(found),
         "versions": [],
     }
     return finite(data)
 
 
+def columns(found: Sequence[Method]) -> list[str]:
+    """The titles of `table`."""
+    return [name for name in COLUMNS if name != "success rate" or _has_success(found)]
+
+
 def table(found: Sequence[Method]) -> list[list[str]]:
-    """A row for each method: what `COLUMNS` says; with several seeds interquartile means and their 95 % intervals."""
+    """A row for each method: what `columns` says, with several seeds as `results.score` shows them."""
     rows = []
-    for method in found:
-        steps, success = method.values("eval_return")[0][-1], method.values("eval_success")[1]
-        rate = results.score(100 * success[:, -1]) + " %" if success.size else ""
-        rows.append([method.label, str(len(method.agents)), f"{steps:,}", results.score(method.scores), rate])
-    return rows if any(row[-1] for row in rows) else [row[:-1] for row in rows]
+    for one in standings(found):
+        rate = "" if one.success is None else results.score(100 * one.success) + " %"
+        number = str(len(one.method.agents))
+        rows.append([one.method.label, results.score(one.returns), rate, number, f"{one.steps:,}"])
+    return rows if _has_success(found) else [[*row[:2], *row[3:]] for row in rows]
+
+
+def _has_success(found: Sequence[Method]) -> bool:
+    return any(method.values("eval_success")[0].size for method in found)
+
+
+def notes(found: Sequence[Method]) -> list[str]:
+    """What one has to know of the table, a line each: steps that are not equal, seeds that carry no interval."""
+    lines, steps = [], compared_at(found)
+    longer = [f"{method.label} went on to {method.longest:,}" for method in found if method.longest > steps]
+    if longer:
+        lines.append(f"compared at {steps:,} environment steps, the most that all have reached; {', '.join(longer)}")
+    apart = [f"{one.method.label} at {one.steps:,}" for one in standings(found) if one.steps != steps]
+    if apart:
+        lines.append(f"not evaluated at {steps:,} steps, but near it: {', '.join(apart)}")
+    if any(not has_interval(len(method.agents)) for method in found):
+        around = f"; in parentheses: {spread_name(2)}" if any(_is_few(len(one.agents)) for one in found) else ""
+        lines.append(f"fewer than {fewest_seeds()} seeds carry no 95 % interval{around}")
+    return lines
+
+
+def _is_few(number: int) -> bool:
+    """Whether so many seeds differ, but carry no interval."""
+    return number > 1 and not has_interval(number)
 
 
 def _panel(found: Sequence[Method], metric: str, title: str) -> Json:
     series = [curve(method.label, *method.values(metric)) for method in found if method.values(metric)[0].size]
-    return {"title": title, "x": "environment steps", "series": series}
+    return {"title": title, "x": "environment steps", "references": [], "series": series}
 
 
 def improvement(found: Sequence[Method]) -> Json:
-    """How probable it is that a run of the method of a row is better than one of the column's, with 95 % intervals."""
-    pairs = [[None if a is b else (a.scores, b.scores) for b in found] for a in found]
+    """How probable it is that a run of the method of a row is better than one of the column's, with 95 % intervals.
+
+    An interval is NaN where the seeds are too few for one.
+    """
+    scores = [one.returns for one in standings(found)]
+    pairs = [[None if a is b else (a, b) for b in scores] for a in scores]
     intervals = [[pair and improvement_interval(*pair) for pair in row] for row in pairs]
     return {
         "labels": [method.label for method in found],

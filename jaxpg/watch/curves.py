@@ -3,43 +3,80 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
 
 from jaxpg.run import figures, results
 from jaxpg.run.config import Config
-from jaxpg.run.statistics import bootstrap_interval, interquartile_mean
+from jaxpg.run.statistics import interquartile_mean, spread, spread_name
 
 Json = dict[str, Any]
 PANELS = {"eval_return": "return", "eval_success": "success rate"}  # metric -> title
+# Means over the updates between two lines of metrics, where the algorithm has such a thing.
+DIAGNOSTICS = {
+    "kl": "KL divergence of an update",
+    "entropy": "entropy of the policy",
+    "sigma": "standard deviation of the policy",
+    "value_loss": "value loss",
+    "gradient_norm": "norm of the gradient",
+}
+POLICY, TRAINING = "deterministic policy", "while training"
 
 
-def curves(config: Config, lines: Sequence[Json]) -> list[Json]:
-    """A panel for return and success: of the settings of a sweep, or while training and of the deterministic policy."""
+def curves(config: Config, lines: Sequence[Json], references: Mapping[str, float]) -> list[Json]:
+    """A panel for return and success: of the settings of a sweep, or while training and of the deterministic policy.
+
+    Args:
+      config, lines: of the run.
+      references: returns to compare with, by what they are.
+    """
     panels = []
     for name, title in PANELS.items():
-        if config.sweep:
-            drawn = [(label, name, chosen) for label, chosen in results.curves(config, lines).items()]
-        else:
-            drawn = [("deterministic policy", name, slice(None))]
-            drawn += [("while training", "return", slice(None))] if name == "eval_return" else []
-        found = [curve(label, *figures.series(lines, metric, chosen)) for label, metric, chosen in drawn]
-        panels.append({"title": title, "x": "environment steps", "series": [one for one in found if one["steps"]]})
+        drawn = [(label, name, chosen) for label, chosen in _agents(config, lines, POLICY).items()]
+        if not config.sweep and name == "eval_return":
+            drawn.append((TRAINING, "return", slice(None)))
+        panels.append(_panel(title, [curve(label, *figures.series(lines, *which)) for label, *which in drawn]))
+    panels[0]["references"] = [{"label": label, "value": value} for label, value in references.items()]
     return [panel for panel in panels if panel["series"]]
 
 
+def diagnostics(config: Config, lines: Sequence[Json]) -> list[Json]:
+    """A panel for each of `DIAGNOSTICS` that was measured: of the settings of a sweep, or of the one there is."""
+    agents = _agents(config, lines, TRAINING)
+    found = [
+        _panel(title, [curve(label, *figures.series(lines, name, chosen)) for label, chosen in agents.items()])
+        for name, title in DIAGNOSTICS.items()
+    ]
+    return [panel for panel in found if panel["series"]]
+
+
+def _agents(config: Config, lines: Sequence[Json], otherwise: str) -> dict[str, slice]:
+    """The agents of each curve by its label."""
+    return results.curves(config, lines) if config.sweep else {otherwise: slice(None)}
+
+
+def _panel(title: str, series: Sequence[Json]) -> Json:
+    return {
+        "title": title,
+        "x": "environment steps",
+        "references": [],
+        "series": [one for one in series if one["steps"]],
+    }
+
+
 def curve(label: str, steps: np.ndarray, values: np.ndarray) -> Json:
-    """One curve; of several agents, `[S, K]`, their interquartile mean and its 95 % interval."""
+    """One curve; of several agents, `[S, K]`, their interquartile mean and its `spread`."""
     several = len(values) > 1 and len(steps)
-    low, high = bootstrap_interval(values) if several else (None, None)
+    low, high = spread(values) if several else (None, None)
     return {
         "label": label,
         "steps": steps.tolist(),
         "mean": numbers(interquartile_mean(values)),
         "low": numbers(low) if several else None,
         "high": numbers(high) if several else None,
+        "band": f"{len(values)} seeds, {spread_name(len(values))}" if several else None,
     }
 
 

@@ -1,18 +1,27 @@
-"""A robot in the plane: the geoms of a MuJoCo model as capsules, seen by a camera without perspective.
+"""A robot in the plane: the geoms of a MuJoCo model in outline, seen by a camera without perspective.
 
-What the camera sees of a point p is (right . p, up . p). Every geom is drawn as the capsule that fills its bounding box
-best, which for capsules, cylinders and spheres is what they are.
+What the camera sees of a point p is (right . p, up . p). The outline of a geom is the convex hull of some of its points
+with a rim around it: two points and a radius are a capsule, eight corners without a rim a box.
 """
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from typing import Any, NamedTuple
 
 import mujoco
 import numpy as np
 
+from jaxpg.run.attempts import NotDrawn
+
 SIDE = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])  # of models without a camera
 FAR = 4.0  # a robot that travels this many times its own size is followed
+BEYOND = 20.0  # of the model's size: what is farther away is drawn there
+ROUND = 16  # points of a circle
+DIRECTIONS = 64  # in which a mesh's or an ellipsoid's outermost points are looked for
+BARE = "#9aa5b3"  # of a body without geoms
+CORNERS = np.array([(x, y, z) for x in (-1.0, 1.0) for y in (-1.0, 1.0) for z in (-1.0, 1.0)])
+AXES = ("x", "y", "z")
 
 
 class Motor(NamedTuple):
@@ -29,55 +38,133 @@ class Motor(NamedTuple):
     sign: int
 
 
+class Part(NamedTuple):
+    """A geom, or a body that has none.
+
+    Attributes:
+      number: the geom's or the body's in the model.
+      points: whose convex hull it is, in its own frame, `[K, 3]` [m].
+      radius: of the rim around them [m].
+      color: such as `#cc4c4c`.
+    """
+
+    number: int
+    points: np.ndarray
+    radius: float
+    color: str
+
+
 class Picture(NamedTuple):
     """What is drawn of a model.
 
     Attributes:
       model: the model.
       axes: right, up and towards the viewer, `[3, 3]`.
-      geom: the numbers of its visible geoms, `[P]`.
-      middle: of each capsule's axis, in the geom's frame, `[P, 3]`.
-      axis: from there to the axis's end, `[P, 3]`.
-      radius: `[P]`.
-      color: such as `#cc4c4c`, `[P]`.
+      parts: the farthest first.
+      of_bodies: whether they are bodies, each as the box that has its inertia; else geoms.
       motors: the driven hinges.
     """
 
     model: Any
     axes: np.ndarray
-    geom: np.ndarray
-    middle: np.ndarray
-    axis: np.ndarray
-    radius: np.ndarray
-    color: list[str]
+    parts: list[Part]
+    of_bodies: bool
     motors: list[Motor]
 
 
 class Frames(NamedTuple):
-    """F frames in the plane [m].
+    """F frames in the plane.
 
     Attributes:
-      parts: the two ends of each capsule's axis, x and y of each, `[F, P, 4]`.
-      motors: where each hinge is, `[F, M, 2]`.
-      goal: `[2]`, or None.
+      place: the origin of each part's frame, `[F, P, 2]` [m].
+      turn: what the camera sees of the frame's axes, `[F, P, 2, 3]`.
+      motors: where each hinge is, `[F, M, 2]` [m].
+      goal: `[2]` [m], or None.
     """
 
-    parts: np.ndarray
+    place: np.ndarray
+    turn: np.ndarray
     motors: np.ndarray
     goal: np.ndarray | None
 
 
 def picture(model: Any) -> Picture:
-    """The visible geoms of a model, without planes and height fields, and its driven hinges."""
+    """The geoms of a model without planes and height fields, and its driven hinges.
+
+    Those that are visible are drawn; where none is, as in models of which the visual geoms were removed, all; and where
+    there is none at all, the bodies.
+
+    Raises:
+      NotDrawn: there is no body either.
+    """
+    axes, data = camera(model), mujoco.MjData(model)
+    mujoco.mj_kinematics(model, data)
+    mujoco.mj_comPos(model, data)
+    geoms = drawn_geoms(model)
+    parts = [Part(i, *_outline(model, i), _color(_rgba(model, i))) for i in geoms] or _bodies(model)
+    if not parts:
+        raise NotDrawn("the model has no geoms and no bodies")
+    depth = (data.geom_xpos if geoms else data.xipos) @ axes[2]
+    parts.sort(key=lambda part: round(float(depth[part.number]), 6))
+    return Picture(model, axes, parts, not geoms, _motors(model, axes))
+
+
+def drawn_geoms(model: Any) -> list[int]:
+    """The visible ones; where there is none, all; planes and height fields left out."""
     endless = (mujoco.mjtGeom.mjGEOM_PLANE, mujoco.mjtGeom.mjGEOM_HFIELD)
-    visible = (model.geom_group < 3) & ~np.isin(model.geom_type, endless)
-    geom = np.array([i for i in np.flatnonzero(visible) if _rgba(model, i)[3]], int)
-    half = model.geom_aabb[geom, 3:]
-    _, radius, longest = np.sort(half, axis=1).T
-    axis = (longest - radius)[:, None] * np.eye(3)[np.argmax(half, axis=1)]
-    axes = camera(model)
-    colors = ["#" + "".join(f"{round(255 * float(x)):02x}" for x in _rgba(model, i)[:3]) for i in geom]
-    return Picture(model, axes, geom, model.geom_aabb[geom, :3], axis, radius, colors, _motors(model, axes))
+    drawn = [int(i) for i in np.flatnonzero(~np.isin(model.geom_type, endless)) if _rgba(model, i)[3]]
+    return [i for i in drawn if model.geom_group[i] < 3] or drawn
+
+
+def _outline(model: Any, geom: int) -> tuple[np.ndarray, float]:
+    """Points `[K, 3]` in the geom's frame, and the radius around them."""
+    kind, size = model.geom_type[geom], model.geom_size[geom]
+    if kind == mujoco.mjtGeom.mjGEOM_SPHERE:
+        return np.zeros((1, 3)), float(size[0])
+    if kind == mujoco.mjtGeom.mjGEOM_CAPSULE:
+        return np.array([[0, 0, -size[1]], [0, 0, size[1]]]), float(size[0])
+    if kind == mujoco.mjtGeom.mjGEOM_CYLINDER:
+        angle = np.linspace(0, 2 * np.pi, ROUND, endpoint=False)
+        ends = [
+            np.stack([size[0] * np.cos(angle), size[0] * np.sin(angle), 0 * angle + z]) for z in (-size[1], size[1])
+        ]
+        return np.concatenate(ends, axis=1).T, 0.0
+    if kind == mujoco.mjtGeom.mjGEOM_ELLIPSOID:
+        return size * _directions(), 0.0
+    if kind == mujoco.mjtGeom.mjGEOM_MESH:
+        return _outermost(model, int(model.geom_dataid[geom])), 0.0
+    return model.geom_aabb[geom, :3] + CORNERS * model.geom_aabb[geom, 3:], 0.0
+
+
+def _directions() -> np.ndarray:
+    """Unit vectors spread evenly over the sphere, on a spiral, `[DIRECTIONS, 3]`."""
+    height = 1 - (2 * np.arange(DIRECTIONS) + 1) / DIRECTIONS
+    angle, around = np.pi * (3 - np.sqrt(5)) * np.arange(DIRECTIONS), np.sqrt(1 - height**2)
+    return np.stack([around * np.cos(angle), around * np.sin(angle), height], axis=1)
+
+
+def _outermost(model: Any, mesh: int) -> np.ndarray:
+    """The vertices of a mesh that are the farthest in some direction."""
+    first = model.mesh_vertadr[mesh]
+    vertices = model.mesh_vert[first : first + model.mesh_vertnum[mesh]]
+    return vertices[np.unique(np.argmax(vertices @ _directions().T, axis=0))].astype(float)
+
+
+def _bodies(model: Any) -> list[Part]:
+    """Boxes of even density with the mass and inertia of the bodies, as MuJoCo's viewer has them.
+
+    I_x = m (b^2 + c^2) / 3 of a box with half sides a, b, c: a = sqrt(3 (I_y + I_z - I_x) / (2 m))
+    """
+    parts = []
+    for body in np.flatnonzero(model.body_mass > 0):
+        inertia, mass = model.body_inertia[body], model.body_mass[body]
+        half = np.sqrt(np.maximum(1.5 * (inertia.sum() - 2 * inertia) / mass, 0))
+        parts.append(Part(int(body), CORNERS * half, 0.0, BARE))
+    return parts
+
+
+def _color(rgba: np.ndarray) -> str:
+    return "#" + "".join(f"{round(255 * float(np.clip(x, 0, 1))):02x}" for x in rgba[:3])
 
 
 def camera(model: Any) -> np.ndarray:
@@ -110,50 +197,93 @@ def _motors(model: Any, axes: np.ndarray) -> list[Motor]:
     return found
 
 
+def axis_labels(axes: np.ndarray) -> tuple[str, str]:
+    """What a picture shows to the right and upwards: an axis of the world, or what the camera calls so.
+
+    >>> axis_labels(SIDE), axis_labels(-SIDE), axis_labels(np.array([[0.8, 0.6, 0.0], [0.0, 0.0, 1.0]]))
+    (('x [m]', 'z [m]'), ('\u2212x [m]', '\u2212z [m]'), ('to the right [m]', 'z [m]'))
+    """
+    names = []
+    for direction, otherwise in zip(axes[:2], ("to the right", "upwards"), strict=True):
+        along = int(np.argmax(np.abs(direction)))
+        sign = "" if direction[along] > 0 else "\u2212"
+        names.append(f"{sign}{AXES[along]} [m]" if abs(direction[along]) > 1 - 1e-6 else f"{otherwise} [m]")
+    return names[0], names[1]
+
+
 def draw(picture: Picture, qpos: np.ndarray, goal: np.ndarray | None = None) -> Frames:
     """What the camera sees of the joint positions `[F, nq]`, and of the goal `[F, 3]`, which stays where it is.
 
-    A robot that travels is drawn in the middle.
+    A robot that travels is drawn in the middle; one whose position is not finite stays where it was.
     """
-    data, joints = mujoco.MjData(picture.model), [motor.joint for motor in picture.motors]
-    ends, anchors = np.zeros((len(qpos), len(picture.geom), 2, 3)), np.zeros((len(qpos), len(joints), 3))
-    for i, q in enumerate(qpos):
+    model, data = picture.model, mujoco.MjData(picture.model)
+    joints, numbers = [motor.joint for motor in picture.motors], [part.number for part in picture.parts]
+    place, turn = np.zeros((len(qpos), len(numbers), 3)), np.zeros((len(qpos), len(numbers), 3, 3))
+    anchors = np.zeros((len(qpos), len(joints), 3))
+    for i, q in enumerate(_held(qpos, model.qpos0)):
         data.qpos = q
-        mujoco.mj_kinematics(picture.model, data)
-        turned = data.geom_xmat[picture.geom].reshape(-1, 3, 3)
-        middle = data.geom_xpos[picture.geom] + np.einsum("pij,pj->pi", turned, picture.middle)
-        axis = np.einsum("pij,pj->pi", turned, picture.axis)
-        ends[i] = np.stack([middle - axis, middle + axis], axis=1)
+        mujoco.mj_kinematics(model, data)
+        mujoco.mj_comPos(model, data)  # where the bodies' inertias are
+        found, turned = (data.xipos, data.ximat) if picture.of_bodies else (data.geom_xpos, data.geom_xmat)
+        place[i], turn[i] = found[numbers], turned[numbers].reshape(-1, 3, 3)
         anchors[i] = data.xanchor[joints]
-    ends, anchors = ends @ picture.axes[:2].T, anchors @ picture.axes[:2].T
-    place = _place(ends)
-    return Frames(
-        parts=(ends - place[:, None, None]).reshape(len(qpos), -1, 4),
-        motors=anchors - place[:, None],
-        goal=None if goal is None else picture.axes[:2] @ goal[0],
+    plane = picture.axes[:2]
+    frames = Frames(place @ plane.T, plane @ turn, anchors @ plane.T, None if goal is None else _seen_goal(plane, goal))
+    return _in_the_middle(picture, frames)
+
+
+def _held(qpos: np.ndarray, first: np.ndarray) -> Iterator[np.ndarray]:
+    """Each position, or the last one before it that is finite."""
+    for q in qpos:
+        first = q if np.isfinite(q).all() else first
+        yield first
+
+
+def _seen_goal(plane: np.ndarray, goal: np.ndarray) -> np.ndarray | None:
+    return plane @ goal[0] if np.isfinite(goal[0]).all() else None
+
+
+def points(picture: Picture, frames: Frames) -> np.ndarray:
+    """The points of all parts, whose hulls are drawn, `[F, K, 2]`."""
+    each = [
+        frames.place[:, i, None] + np.einsum("fij,kj->fki", frames.turn[:, i], part.points)
+        for i, part in enumerate(picture.parts)
+    ]
+    return np.concatenate(each, axis=1)
+
+
+def _in_the_middle(picture: Picture, frames: Frames) -> Frames:
+    """With a robot that travels in the middle of the picture, and nothing farther away than can be seen."""
+    middle = followed(points(picture, frames))
+    reach = BEYOND * max(float(picture.model.stat.extent), 1.0)
+    center = picture.axes[:2] @ picture.model.stat.center
+    place, motors = (
+        np.clip(x - middle[:, None], center - reach, center + reach) for x in (frames.place, frames.motors)
     )
+    return frames._replace(place=place, motors=motors)
 
 
-def _place(ends: np.ndarray) -> np.ndarray:
+def followed(points: np.ndarray) -> np.ndarray:
     """Where the middle of the picture is in each frame, `[F, 2]`: with a robot that travels, else at the origin."""
-    points = ends.reshape(len(ends), -1, 2)
     place = np.zeros((len(points), 2))
     if np.ptp(points[..., 0]) > FAR * np.ptp(points, axis=1).max():
         place[:, 0] = points[..., 0].mean(axis=1)
     return place
 
 
-def extent(frames: list[Frames], radius: np.ndarray, margin: float) -> list[float]:
+def extent(picture: Picture, frames: list[Frames], margin: float) -> list[float]:
     """The rectangle that holds all that is drawn: x_min, y_min, x_max, y_max.
 
     Args:
+      picture: what is drawn.
       frames: to be drawn in the same rectangle.
-      radius: of the capsules, `[P]`.
       margin: what is left around them, as a fraction of the larger side.
     """
-    ends = [one.parts.reshape(*one.parts.shape[:2], 2, 2) for one in frames]
-    corners = [sign * radius[:, None, None] + one for one in ends for sign in (-1, 1)]
-    points = [one.reshape(-1, 2) for one in corners] + [one.goal[None] for one in frames if one.goal is not None]
-    low, high = np.concatenate(points).min(axis=0), np.concatenate(points).max(axis=0)
-    room = margin * np.max(high - low)
+    rim = np.repeat([part.radius for part in picture.parts], [len(part.points) for part in picture.parts])[:, None]
+    drawn = [points(picture, one) for one in frames]
+    corners = [(one + sign * rim).reshape(-1, 2) for one in drawn for sign in (-1, 1)]
+    corners += [one.goal[None] for one in frames if one.goal is not None]
+    low, high = np.concatenate(corners).min(axis=0), np.concatenate(corners).max(axis=0)
+    size = float(np.max(high - low))
+    room = margin * size if size else 1.0  # around a single point
     return [*(low - room).tolist(), *(high + room).tolist()]

@@ -19,6 +19,7 @@ SCRIPTS = (  # in the order in which they are read: one module
     "palette",
     "axes",
     "rollout",
+    "outline",
     "stage",
     "player",
     "keys",

@@ -3,20 +3,20 @@
 from __future__ import annotations
 
 import functools
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from envs.scenes import scene
 from jaxpg.deploy.controller import physical
 from jaxpg.evaluation import play
 from jaxpg.run.policies import StoredPolicy
 from jaxpg.run.program import RUN_ONCE
 from jaxpg.run.state import Policy
 from jaxpg.types import Metrics
+from jaxpg.watch.seen import Seen, seen
 
 
 class Look(NamedTuple):
@@ -61,42 +61,46 @@ class Recording(NamedTuple):
         return np.sum(np.where(alive, self.reward, 0.0), axis=0, dtype=np.float64)
 
 
-def record(stored: StoredPolicy, policies: Sequence[Policy], starts: jax.Array) -> list[Recording]:
+def record(
+    stored: StoredPolicy, policies: Sequence[Policy], starts: jax.Array, view: Seen | None = None
+) -> list[Recording]:
     """An episode of each policy from each start.
 
     Args:
       stored: how policies act, and where.
       policies: all of the same network.
       starts: random keys that fix them, `[N]`.
+      view: what can be seen of the environment; None: it is looked for.
     """
-    played = jax.jit(lambda policy: _played(stored, policy, starts)).lower(stored.policy).compile(RUN_ONCE)
+    look = jax.vmap(looking(view or seen(stored.env)))
+    played = jax.jit(lambda policy: _played(stored, policy, starts, look)).lower(stored.policy).compile(RUN_ONCE)
     return [jax.tree.map(np.asarray, played(policy)) for policy in policies]
 
 
-def _played(stored: StoredPolicy, policy: Policy, starts: jax.Array) -> Recording:
-    env, look = stored.env, jax.vmap(looking(stored.env))
+def _played(stored: StoredPolicy, policy: Policy, starts: jax.Array, look: Callable[[Any], Look]) -> Recording:
+    env = stored.env
 
-    def seen(step):
+    def shown(step):
         value = stored.value(policy, step.before.obs)
         return look(step.after), physical(stored.interface, step.action), step.reward, value, step.metrics
 
     length = stored.config.env.episode_length
     episodes, (after, command, reward, value, metrics) = play(
-        env, functools.partial(stored.act, policy), starts, length, seen
+        env, functools.partial(stored.act, policy), starts, length, shown
     )
     first = look(jax.vmap(env.reset)(jax.random.clone(starts)))  # the same starts on purpose
     looks = jax.tree.map(lambda x, rest: jnp.concatenate([x[None], rest]), first, after)
     return Recording(looks, command, reward, value, episodes.length, metrics, episodes.diverged)
 
 
-def looking(env: Any):
+def looking(view: Seen) -> Callable[[Any], Look]:
     """`look(State) -> Look` of an environment's states."""
-    view, plane = scene(env), getattr(env, "phase_plane", None)
+    scene, plane = view
 
     def look(state):
         return Look(
-            qpos=view.qpos(state) if view else None,
-            goal=view.goal(state) if view and view.goal else None,
+            qpos=scene.qpos(state) if scene else None,
+            goal=scene.goal(state) if scene and scene.goal else None,
             plane=plane.coordinates(state) if plane else None,
         )
 

@@ -7,9 +7,12 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import jax
+import numpy as np
 
-from jaxpg.run import agents, folder, policies, results
+from envs.scenes import references
+from jaxpg.run import agents, folder, policies, repeat, results
 from jaxpg.run import config as configuration
+from jaxpg.run.attempts import attempt
 from jaxpg.run.cache import compilation_cache, physics_cache
 from jaxpg.run.config import Config
 from jaxpg.run.folder import RunFolder
@@ -17,13 +20,23 @@ from jaxpg.run.policies import StoredPolicy
 from jaxpg.run.program import SELECTION_SEED
 from jaxpg.run.statistics import counted_returns
 from jaxpg.run.terminal import shown
-from jaxpg.watch.curves import curves, finite
+from jaxpg.watch.clips import limits_of
+from jaxpg.watch.curves import curves, diagnostics, finite
 from jaxpg.watch.page import page
 from jaxpg.watch.player import episodes
 from jaxpg.watch.recording import Recording, record
+from jaxpg.watch.seen import seen
+from jaxpg.watch.smoothness import NEAR, chatter, share_at_limit
 
 Json = dict[str, Any]
-PLAYED = 200  # episodes of each policy, where an evaluation has as many
+Stages = Mapping[str, StoredPolicy]
+MOST = 2**18  # steps that are recorded of each policy: of longer episodes not all that an evaluation plays
+UNTRAINED = "before training"
+SMOOTHNESS = (
+    "Chatter: the mean of |u(t) \u2212 u(t \u2212 1)| / (2 limit) over steps and commands u, 0 % where they stand "
+    "still, 100 % where they jump from limit to limit at every step. At a limit: the share of steps and commands "
+    f"with |u| \u2265 {NEAR} limit."
+)
 
 
 def of_run(path: str, agent: int | None, cache: bool, say: Callable[[str], None]) -> None:
@@ -33,7 +46,7 @@ def of_run(path: str, agent: int | None, cache: bool, say: Callable[[str], None]
       path: the run folder.
       agent: whose episodes are shown, from 0; None takes the one with the best evaluation.
       cache: whether compiled programs are kept.
-      say: takes a line when it is written.
+      say: takes a line when it is written, and one for each thing that could not be drawn.
 
     Raises:
       UserError: no run, no checkpoint in it, no such agent, or the page cannot be written.
@@ -41,62 +54,141 @@ def of_run(path: str, agent: int | None, cache: bool, say: Callable[[str], None]
     run_folder = folder.find(path)
     with physics_cache(cache), compilation_cache(cache, say):
         best, last = policies.load_several(path, ["best", "last"], agent)
-        stages = {"before training": policies.untrained(best)}
+        stages = {UNTRAINED: policies.untrained(best)}
         if best.evaluated:
             stages["best"] = best
         if last.update != best.update or not best.evaluated:
             stages["last"] = last
-        content = page(report(run_folder, configuration.load(run_folder.config), stages))
+        data = report(run_folder, configuration.load(run_folder.config), stages)
+    content = page(data)
     folder.replace(run_folder.report, content)
+    for line in data["notes"]:
+        say(f"note: {run_folder.report.name} has {line}")
     say(f"{run_folder.report}: {len(content) / 1000:,.0f} kB, to be opened in a browser")
 
 
-def report(run_folder: RunFolder, config: Config, stages: Mapping[str, StoredPolicy]) -> Json:
-    """What the page shows, as plain values.
+def report(run_folder: RunFolder, config: Config, stages: Stages) -> Json:
+    """What the page shows, as plain values; what cannot be drawn is left out, and said in its `notes`.
 
     Args:
       run_folder, config: of the run.
       stages: one agent at some points of its training, by what they are called.
     """
-    lines, stored = folder.read_metrics(run_folder, config.num_agents), next(iter(stages.values()))
-    number = min(PLAYED, config.run.eval_episodes)
-    starts = jax.random.split(jax.random.key(SELECTION_SEED), config.run.eval_episodes)[:number]
-    recordings = record(stored, [stage.policy for stage in stages.values()], starts)
+    lines, notes, stored = folder.read_metrics(run_folder, config.num_agents), [], next(iter(stages.values()))
+
+    def part(what: str, draw: Callable[[], Any], otherwise: Any = None) -> Any:
+        drawn = attempt(what, draw, notes.append)
+        return otherwise if drawn is None else drawn
+
+    view = seen(stored.env, notes.append)
+    starts = _starts(config)
+    recordings = part("episodes", lambda: record(stored, [one.policy for one in stages.values()], starts, view))
+    compared = part("returns to compare with", lambda: _references(config, stored, stages, recordings), {})
     shown_agent = [["episodes of", stored.agent]] if config.num_agents > 1 else []
     data = {
         "kind": "run",
         "title": agents.described(config),
-        "facts": [*_progress(lines), *shown_agent, *_returns(stages, recordings), ["run folder", str(run_folder.path)]],
-        "curves": curves(config, lines),
+        "facts": [*_progress(config, lines), *shown_agent, ["run folder", str(run_folder.path)]],
+        "head": recordings and part("table of policies", lambda: _policies(config, stages, recordings, compared)),
+        "curves": part("learning curves", lambda: curves(config, lines, compared), []),
+        "diagnostics": part("diagnostics", lambda: diagnostics(config, lines), []),
         "tables": _settings(config, lines),
         "improvement": None,
-        "configuration": [[name, str(value)] for name, value in configuration.named(config).items()],
-        "versions": _versions(run_folder),
+        "command": part("command", lambda: repeat.command(config)),
+        "configuration": part("configuration", lambda: _configuration(config), []),
+        "versions": part("versions", lambda: _versions(run_folder), []),
+        **{"player": None, "portrait": None, "workspace": None},
     }
-    return finite(data | episodes(stages, recordings))
+    played = recordings and part("episodes", lambda: episodes(view, stages, recordings, notes.append))
+    return finite(data | (played or {}) | {"notes": notes})
 
 
-def _progress(lines: Sequence[Json]) -> list[list[str]]:
+def _starts(config: Config) -> jax.Array:
+    """Those of the run's evaluations; of long episodes the first that are `MOST` steps."""
+    number = max(1, min(config.run.eval_episodes, MOST // config.env.episode_length))
+    return jax.random.split(jax.random.key(SELECTION_SEED), config.run.eval_episodes)[:number]
+
+
+def _progress(config: Config, lines: Sequence[Json]) -> list[list[str]]:
+    """How long it was trained; of several agents how good they are together, as the table is about one of them."""
     if not lines:
         return []
     last = lines[-1]
     rows = [["trained", f"{last['steps']:,} steps in {last['seconds']:.1f} s, {last['update']:,} updates"]]
     evaluated = [line for line in lines if "eval_return" in line]
-    if evaluated:
-        best = folder.jsonable(results.best_returns(lines))
-        rows.append(["return", f"{shown(evaluated[-1]['eval_return'])} at the last evaluation, {shown(best)} at best"])
+    if evaluated and config.num_agents > 1:
+        best = shown(folder.jsonable(results.best_returns(lines)))
+        mean = f"{shown(evaluated[-1]['eval_return'])} at the last evaluation, {best} at the best of each"
+        rows.append([f"mean return of {config.num_agents} agents", mean])
     return rows
 
 
-def _returns(stages: Mapping[str, StoredPolicy], recordings: Sequence[Recording]) -> list[list[str]]:
-    """Of each policy, over all of its episodes."""
-    rows = []
-    for label, recording in zip(stages, recordings, strict=True):
-        returns = counted_returns(recording.episode_return, recording.diverged)
-        error = returns.std(ddof=1) / math.sqrt(len(returns)) if len(returns) > 1 else math.nan
-        exploded = f", {recording.diverged.sum()} of which diverged" if recording.diverged.any() else ""
-        rows.append([f"return, {label}", f"{returns.mean():.1f} ± {error:.1f} over {len(returns)} episodes{exploded}"])
-    return rows
+def _policies(config: Config, stages: Stages, recordings: Sequence[Recording], compared: Mapping[str, float]) -> Json:
+    """What each policy earns, and how smoothly; below them what else there is to compare with."""
+    measured = [
+        _measured(label, stage, recording) for (label, stage), recording in zip(stages.items(), recordings, strict=True)
+    ]
+    measured += [
+        {"policy": label, "return": f"{value:.1f}"} for label, value in compared.items() if label not in stages
+    ]
+    columns = list(dict.fromkeys(name for one in measured for name in one))
+    number, of = len(recordings[0].length), config.run.eval_episodes
+    which = "the episodes" if number == of else f"the first {number} of the {of} episodes"
+    return {
+        "title": "policies",
+        "columns": columns,
+        "rows": [[one.get(name, "") for name in columns] for one in measured],
+        "note": f"Mean and standard error over {which} of an evaluation while training. {SMOOTHNESS}",
+    }
+
+
+def _measured(label: str, stage: StoredPolicy, recording: Recording) -> dict[str, str]:
+    """A row of the table: what there is to say of a policy, by column."""
+    every, limits = np.arange(len(recording.length)), limits_of(stage)
+    row = {"policy": label, "return": _earned(recording)}
+    if "success" in recording.metrics:
+        row["success"] = _percent(recording.metrics["success"][recording.length - 1, every])
+    row["chatter"] = _percent(chatter(recording.command, limits, recording.length))
+    row["at a limit"] = _percent(share_at_limit(recording.command, limits, recording.length))
+    row["updates"] = f"{stage.update:,}"
+    return row | ({"diverged": str(int(recording.diverged.sum()))} if recording.diverged.any() else {})
+
+
+def _earned(recording: Recording) -> str:
+    """Mean return and its standard error."""
+    returns = counted_returns(recording.episode_return, recording.diverged)
+    if not np.isfinite(returns).all():
+        return "n/a"
+    mean = f"{returns.mean():.1f}"
+    return mean if len(returns) == 1 else f"{mean} ± {returns.std(ddof=1) / math.sqrt(len(returns)):.1f}"
+
+
+def _percent(values: np.ndarray) -> str:
+    """Mean of those that are numbers."""
+    numbers = values[np.isfinite(values)]
+    return f"{100 * numbers.mean(dtype=float):.1f} %" if len(numbers) else "n/a"
+
+
+def _references(
+    config: Config, stored: StoredPolicy, stages: Stages, recordings: Sequence[Recording] | None
+) -> dict[str, float]:
+    """Returns to compare with: of the untrained policy, the one that ends the run, those the environment knows."""
+    found = {str(label): float(value) for label, value in references(stored.env).items()}
+    if config.run.stop_return is not None:
+        found["stop_return"] = config.run.stop_return
+    for label, recording in zip(stages, recordings or [], strict=False):
+        if label == UNTRAINED:
+            found[label] = float(counted_returns(recording.episode_return, recording.diverged).mean())
+    return {label: value for label, value in found.items() if math.isfinite(value)}
+
+
+def _configuration(config: Config) -> list[list[str | None]]:
+    """Name and value of each option, and its default where that is another."""
+    defaults = repeat.defaults(config)
+    return [
+        [name, str(value), None if defaults.get(name) == value else str(defaults.get(name))]
+        for name, value in configuration.named(config).items()
+    ]
 
 
 def _versions(run_folder: RunFolder) -> list[list[str]]:
@@ -110,4 +202,6 @@ def _settings(config: Config, lines: Sequence[Json]) -> list[Json]:
     if not config.sweep:
         return []
     rows = [[setting, score] for setting, score in results.table(config, lines).items()]
-    return [{"title": results.heading(config).rstrip(":"), "columns": ["setting", "return"], "rows": rows}]
+    return [
+        {"title": results.heading(config).rstrip(":"), "columns": ["setting", "return"], "rows": rows, "note": None}
+    ]

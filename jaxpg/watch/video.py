@@ -12,7 +12,7 @@ from typing import Any
 import jax
 import numpy as np
 
-from envs.scenes import Scene, scene
+from envs.scenes import Scene
 from jaxpg.run import folder, policies
 from jaxpg.run.agents import described
 from jaxpg.run.cache import compilation_cache, physics_cache
@@ -20,8 +20,9 @@ from jaxpg.run.errors import UserError
 from jaxpg.run.policies import StoredPolicy
 from jaxpg.run.schema import RenderOptions
 from jaxpg.watch import gl, movie
-from jaxpg.watch.clips import Clip, clip, frames
+from jaxpg.watch.clips import Clip, clip, command_names, frames, limits_of
 from jaxpg.watch.recording import record
+from jaxpg.watch.seen import seen
 
 LARGEST = 8192  # pixels of an image, either way
 FINEST = 10_000  # of the denominator of pictures a second
@@ -84,8 +85,10 @@ def grid(number: int) -> tuple[int, int]:
 def _stored(options: RenderOptions, changes: Mapping[str, Any]) -> StoredPolicy:
     saved = "best" if options.checkpoint == "untrained" else options.checkpoint
     stored = policies.load(options.run, saved, options.agent, changes)
-    if scene(stored.env) is None:
-        raise UserError(f"env={stored.config.choices['env']} is no robot: there is nothing to be seen of it")
+    notes: list[str] = []
+    if seen(stored.env, notes.append).scene is None:
+        why = f": {'; '.join(notes)}" if notes else " is no robot: there is nothing to be seen of it"
+        raise UserError(f"env={stored.config.choices['env']}{why}")
     return policies.untrained(stored) if options.checkpoint == "untrained" else stored
 
 
@@ -129,7 +132,7 @@ def images(
     """
     from jaxpg.watch.canvas import Canvas
 
-    view = scene(stored.env)
+    view = seen(stored.env).scene
     with Canvas(view.model, backend, grid(len(clips)), size, view.goal_radius) as canvas:
         for step in shown(clips, every):
             yield canvas.draw([cell(stored, view, one, step) for one in clips])
@@ -139,11 +142,10 @@ def cell(stored: StoredPolicy, view: Scene, one: Clip, step: int) -> Any:
     """What is drawn of an episode at a step; after its end, what it ended with."""
     from jaxpg.watch.canvas import Cell
 
-    last = len(one.look.qpos) - 1
-    now, names = min(step, last), stored.interface.commands
-    limits = np.array(stored.interface.limits or [1.0] * len(names))
+    last, names = len(one.look.qpos) - 1, command_names(stored)
+    now = min(step, last)
     commands = np.array([one.series[name][now] if now < last else 0.0 for name in names])
-    efforts = commands / limits if len(names) == view.model.nu else np.zeros(view.model.nu)
+    efforts = commands / limits_of(stored) if len(names) == view.model.nu else np.zeros(view.model.nu)
     goal = None if one.look.goal is None else one.look.goal[now]
     return Cell(one.look.qpos[now], goal, efforts, _caption(one, now, last))
 

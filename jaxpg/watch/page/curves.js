@@ -22,18 +22,27 @@ function curves(panel, numberOf) {
   });
   holder.addEventListener("pointerleave", () => read(steps.length - 1));
   holder.addEventListener("keydown", (event) => readByKey(event, state, steps, read));
-  return figure(panel.title, legend, holder, where);
+  return figure(panel.title, legend, holder, where, referencesInWords(panel));
 }
 
-function legendItem({ label }, numberOf) {
+/** Those that lie outside of the picture. */
+function referencesInWords(panel) {
+  const [low, high] = valueRange(panel);
+  const outside = (panel.references ?? []).filter(({ value }) => value < low || value > high);
+  if (!outside.length) return null;
+  const words = outside.map(({ label, value }) => `${label} ${text(value)}`).join(", ");
+  return element("p", { class: "reading" }, `outside of the picture: ${words}`);
+}
+
+function legendItem({ label, band }, numberOf) {
   const sample = shape("svg", { width: 22, height: 10, "aria-hidden": "true" });
   sample.append(shape("path", { class: `line ${seriesClass(numberOf(label))}`, d: "M1 5h20" }));
-  return element("li", {}, sample, element("span", {}, label), element("b", {}));
+  const spread = band ? element("small", {}, band) : null;
+  return element("li", {}, sample, element("span", {}, label), element("b", {}), spread);
 }
 
 function drawCurves(panel, steps, numberOf, width) {
-  const ends = panel.series.flatMap((one) => [one.mean, one.low ?? [], one.high ?? []]);
-  const y = { range: extent(ends, 0.08) };
+  const y = { range: valueRange(panel) };
   const x = { range: [Math.min(0, steps[0] ?? 0), steps.at(-1) || 1], label: panel.x };
   y.ticks = ticks(y.range, 6);
   const left = tickRoom(y.ticks);
@@ -42,11 +51,37 @@ function drawCurves(panel, steps, numberOf, width) {
   const svg = shape("svg", { width, height: box.top + box.height + 40, "aria-hidden": "true" });
   const { X, Y, inside } = axes(svg, box, x, y);
   for (const one of panel.series) drawCurve(inside, one, X, Y, seriesClass(numberOf(one.label)));
+  drawReferences(svg, box, Y, y.range, panel.references ?? []);
   const cursor = svg.appendChild(rule(0, box.top, 0, box.top + box.height, "cursor"));
   const dots = panel.series.map(({ label }) =>
     svg.appendChild(shape("circle", { r: 3.5, class: `dot ${seriesClass(numberOf(label))}` })),
   );
   return { svg, X, Y, cursor, dots };
+}
+
+/** The range of the curves, with those references in it that do not make them smaller than half of the picture. */
+function valueRange({ series, references }) {
+  let [low, high] = extent(series.flatMap((one) => [one.mean, one.low ?? [], one.high ?? []]), 0.08);
+  const room = 0.06 * (high - low);
+  for (const { value } of references ?? []) {
+    const wider = [Math.min(low, value - room), Math.max(high, value + 2 * room)];
+    if (wider[1] - wider[0] <= 2 * (high - low)) [low, high] = wider;
+  }
+  return [low, high];
+}
+
+/** Lines to compare with, each with its name above it; or below, where another name is. */
+function drawReferences(svg, box, Y, [low, high], references) {
+  const right = box.left + box.width;
+  const seen = references.filter(({ value }) => value >= low && value <= high).sort((a, b) => b.value - a.value);
+  let before = -Infinity;
+  for (const { label: name, value } of seen) {
+    const above = Y(value) - 5;
+    const y = above - before < FONT + 2 ? Y(value) + FONT + 2 : above;
+    svg.append(rule(box.left, Y(value), right, Y(value), "reference"));
+    svg.append(label(right, y, "end", `${name} ${text(value)}`, "halo"));
+    before = y;
+  }
 }
 
 function drawCurve(inside, one, X, Y, kind) {
@@ -67,8 +102,8 @@ function showValues(holder, legend, where, panel, steps, { index, drawing }) {
   const words = panel.series.map((one, i) => {
     const near = nearest(one.steps, step);
     const value = one.mean[near] ?? null;
-    const interval = one.low && one.high ? ` [${text(one.low[near])}, ${text(one.high[near])}]` : "";
-    legend.children[i].lastChild.textContent = text(value) + interval;
+    const interval = one.low && one.high ? ` (${text(one.low[near])} to ${text(one.high[near])})` : "";
+    legend.children[i].querySelector("b").textContent = text(value) + interval;
     showDot(drawing, drawing.dots[i], one.steps[near], value);
     return `${one.label} ${text(value)}${interval}`;
   });

@@ -20,20 +20,52 @@ function linkedViews() {
   return [section("Rollout", choices(player, view), views, keysLine())];
 }
 
-function learning() {
-  if (!data.curves.length) return [];
-  const numberOf = seriesNumbers(data.curves);
-  const figures = data.curves.map((panel) => curves(panel, numberOf));
-  return [section("Learning", element("div", { class: "figures" }, ...figures))];
+/** Panels of curves; a series has the same colour in all panels of the page. */
+function learning(title, panels, kind) {
+  if (!panels.length) return [];
+  const numberOf = seriesNumbers([...data.curves, ...data.diagnostics]);
+  return [section(title, element("div", { class: kind }, ...panels.map((panel) => curves(panel, numberOf))))];
+}
+
+/** What `build` makes; if it fails, a line that says so, and the rest of the page goes on. */
+function part(title, build) {
+  try {
+    return build();
+  } catch (error) {
+    console.error(error);
+    return [section(title, element("p", { class: "note" }, `This part could not be drawn: ${error.message}`))];
+  }
+}
+
+function tables() {
+  return data.tables.map((one) => section(one.title, ...noted(one)));
+}
+
+/** What could not be drawn, and what one has to know of the numbers. */
+function remarks(notes) {
+  if (!notes.length) return [];
+  return [element("ul", { class: "remarks" }, ...notes.map((line) => element("li", {}, line)))];
+}
+
+function repeating(command) {
+  return command ? [section("The same run again", element("pre", {}, command))] : [];
 }
 
 function start() {
   document.getElementById("kind").textContent = data.kind === "run" ? "training run" : "comparison of runs";
   const main = document.getElementById("main");
   startTheme();
-  main.replaceChildren(facts(data.facts), ...linkedViews(), ...learning());
-  for (const { title, columns, rows } of data.tables) main.append(section(title, table(title, columns, rows)));
+  main.replaceChildren(
+    facts(data.facts),
+    ...(data.head ? noted(data.head) : []),
+    ...remarks(data.notes),
+    ...part("Rollout", linkedViews),
+    ...part("Learning", () => learning("Learning", data.curves, "figures")),
+    ...part("Tables", tables),
+    ...part("Diagnostics", () => learning("Diagnostics", data.diagnostics, "figures small")),
+  );
   if (data.improvement) main.append(section("Probability of improvement", ...improvement(data.improvement)));
+  main.append(...repeating(data.command));
   for (const [title, rows] of [["Configuration", data.configuration], ["Versions", data.versions]]) {
     if (rows.length) main.append(folded(title, rows));
   }

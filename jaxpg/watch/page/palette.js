@@ -44,7 +44,7 @@ function shadePicture(columns, rows, paint) {
 /** Which colour of the series each label has: the same in every panel that shows several. */
 function seriesNumbers(panels) {
   const numbers = new Map();
-  for (const panel of panels.filter((panel) => panel.series.length > 1)) {
+  for (const panel of panels) {
     for (const { label } of panel.series) if (!numbers.has(label)) numbers.set(label, numbers.size);
   }
   return (label) => numbers.get(label) ?? 0;

@@ -30,7 +30,7 @@ function seriesRange(player, name) {
 }
 
 function limitNamed(player, name) {
-  return player.motors.find((motor) => motor.name === name)?.limit ?? null;
+  return player.limits[name] ?? null;
 }
 
 function drawPanels(player, state, width) {
@@ -56,7 +56,7 @@ function drawPanel(svg, box, x, y, player, state, name) {
   const limit = limitNamed(player, name);
   const right = box.left + box.width;
   if (limit) inside.append(...[-limit, limit].map((value) => rule(box.left, Y(value), right, Y(value), "limit")));
-  const steps = player.motors.some((motor) => motor.name === name); // held from one frame to the next
+  const steps = !["reward", "value"].includes(name); // commands are held from one frame to the next
   const ghost = ghostOf(player, state);
   const line = (episode, kind) =>
     shape("path", { class: kind, d: overTime(episode.series[name], player.dt, X, Y, steps) });

@@ -14,8 +14,10 @@ function portrait(data, player, view) {
     move();
   };
   const move = () => {
-    const path = player && chosen(player, view.state).path;
-    if (path && drawing) drawPath(drawing, data, path, view.state.position, reading);
+    const episode = player && chosen(player, view.state);
+    if (!episode?.path || !drawing) return;
+    drawPath(drawing, data, episode.path, view.state.position);
+    reading.textContent = episodeReading(data, episode, frameOf(episode, view.state));
   };
   onWidth(holder, draw);
   view.listen((changed) => (changed.has("policy") ? draw() : move()));
@@ -27,11 +29,16 @@ function mapOf(grid, { columns, rows, x, y }) {
   const span = (grid.high - grid.low) / 32767;
   const values = Float64Array.from(unpack(grid.data), (number) => grid.low + number * span);
   const [column, row] = [linear(x.range, [0, columns - 1]), linear(y.range, [0, rows - 1])];
-  const value = (px, py) => {
-    const c = clamp(Math.round(column(px)), 0, columns - 1);
-    return values[clamp(Math.round(row(py)), 0, rows - 1) * columns + c];
-  };
+  const value = (px, py) => bilinear(values, columns, rows, column(px), row(py));
   return { ...grid, values, value };
+}
+
+/** The value between the four points of the grid around a column and a row. */
+function bilinear(values, columns, rows, column, row) {
+  const [c, r] = [clamp(Math.floor(column), 0, columns - 2), clamp(Math.floor(row), 0, rows - 2)];
+  const [u, v] = [clamp(column - c, 0, 1), clamp(row - r, 0, 1)];
+  const at = (right, up) => values[(r + up) * columns + c + right];
+  return (1 - v) * ((1 - u) * at(0, 0) + u * at(1, 0)) + v * ((1 - u) * at(0, 1) + u * at(1, 1));
 }
 
 function drawPortrait(holder, data, map, range) {
@@ -95,7 +102,7 @@ function drawBar(holder, svg, box, map, range) {
   svg.append(label(box.left, box.top - 11, "start", "value", "title"));
 }
 
-function drawPath(drawing, data, path, position, reading) {
+function drawPath(drawing, data, path, position) {
   const points = path[0].map((x, i) => [x, path[1][i]]);
   const [frame, here] = [Math.floor(position), pointAt(points, position, data)];
   const past = wrappedPath([...points.slice(0, frame + 1), here], drawing, data);
@@ -104,7 +111,6 @@ function drawPath(drawing, data, path, position, reading) {
   drawing.path.setAttribute("d", past);
   drawing.here.setAttribute("cx", drawing.X(here[0]));
   drawing.here.setAttribute("cy", drawing.Y(here[1]));
-  reading.textContent = pointReading(drawing, data, here);
 }
 
 /** How far an axis that wraps has to be turned so that b is near a. */
@@ -145,7 +151,16 @@ function readMap(reading, drawing, data, event) {
   if (inside) reading.textContent = pointReading(drawing, data, point);
 }
 
-function pointReading({ map }, { x, y }, [px, py]) {
-  const name = (axis, value) => `${axis.label.split(" [")[0]} ${fixed(value, 2)}`;
-  return `${name(x, px)}, ${name(y, py)}: value ${fixed(map.value(px, py), 2)}`;
+function pointReading({ map }, data, point) {
+  return inWords(data, point, map.value(...point));
+}
+
+/** Where the episode is at a frame, and the critic's value there: the same as over time, not that of the map. */
+function episodeReading(data, { path, series }, frame) {
+  return inWords(data, [path[0][frame], path[1][frame]], series.value[frame] ?? null);
+}
+
+function inWords({ x, y }, [px, py], value) {
+  const name = (axis, number) => `${axis.label.split(" [")[0]} ${fixed(number, 2)}`;
+  return `${name(x, px)}, ${name(y, py)}` + (value === null ? "" : `: value ${fixed(value, 2)}`);
 }

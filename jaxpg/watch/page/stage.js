@@ -1,4 +1,4 @@
-// The drawing of a rollout: capsules, goal, and the motors' torques as arcs.
+// The drawing of a rollout: the robot's parts, the goal, and the motors' torques as arcs.
 
 /** Paints the chosen episode, and the ghost behind it, at the state's position. */
 function paintStage(canvas, player, state) {
@@ -83,19 +83,31 @@ function between(numbers, size, episode, position, first, count) {
   });
 }
 
+const PART_NUMBERS = 8; // of a part in a frame: its place, and what is seen of the axes of its frame
+
+/** Every part as the hull of its points with its rim, the farthest first. */
 function paintParts(context, place, player, episode, position, colourOf) {
-  context.lineCap = "round";
+  context.lineCap = context.lineJoin = "round";
   player.parts.forEach((part, i) => {
-    const [x0, y0, x1, y1] = between(episode.parts, 4 * player.parts.length, episode, position, 4 * i, 4);
-    const width = Math.max(3, 2 * part.radius * place.unit);
+    const size = PART_NUMBERS * player.parts.length;
+    const numbers = between(episode.parts, size, episode, position, PART_NUMBERS * i, PART_NUMBERS);
+    const outline = hull(pointsSeen(part, numbers).map(([x, y]) => [place.x(x), place.y(y)]));
+    const rim = Math.max(outline.length > 2 ? 1 : 3, 2 * part.radius * place.unit);
     for (const [extra, style] of [[3, colour("raised")], [0, colourOf(part)]]) {
-      context.beginPath();
-      line(context, place.x(x0), place.y(y0), place.x(x1) + 0.01, place.y(y1));
-      context.lineWidth = width + extra;
-      context.strokeStyle = style;
+      context.lineWidth = rim + extra;
+      context.strokeStyle = context.fillStyle = style;
+      tracePolygon(context, outline);
       context.stroke();
+      context.fill();
     }
   });
+}
+
+function tracePolygon(context, corners) {
+  context.beginPath();
+  corners.forEach(([x, y], i) => (i ? context.lineTo(x, y) : context.moveTo(x, y)));
+  if (corners.length === 1) context.lineTo(corners[0][0] + 0.01, corners[0][1]);
+  context.closePath();
 }
 
 /** Where the motors are at the position, in pixels, and how large their dials are. */

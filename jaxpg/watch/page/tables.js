@@ -10,6 +10,11 @@ function pair([name, words]) {
 
 const NUMBER = /^([−-]?[\d.]|[–-]$|$)/; // what a cell about numbers begins with
 
+/** A table, and what is to be said of it. */
+function noted({ title, columns, rows, note }) {
+  return [table(title, columns, rows), note ? element("p", { class: "note" }, note) : null].filter(Boolean);
+}
+
 /** A table that scrolls by itself where it is too wide. */
 function table(title, columns, rows) {
   const right = columns.map((_, i) => rows.length > 0 && rows.every((row) => NUMBER.test(row[i])));
@@ -32,7 +37,7 @@ function scrolled(title, content) {
 
 const IMPROVEMENT =
   "How likely the run of the row does better than the run of the column, seed against seed, and the interval of " +
-  "that; in bold where the interval leaves out one half.";
+  "that; in bold where the interval leaves out one half. Without an interval the seeds are too few for one.";
 
 /** P(row > column) of all pairs. */
 function improvement({ labels, probability, low, high }) {
@@ -51,14 +56,27 @@ function probabilityCell(p, low, high) {
   const known = low !== null && low !== undefined && high !== null && high !== undefined;
   const sure = known && (low > 0.5 || high < 0.5);
   const words = element(sure ? "b" : "span", {}, fixed(p, 2));
-  const cell = element("td", { class: `number ${p >= 0.5 ? "better" : "worse"}` }, words);
-  cell.style.setProperty("--strength", `${Math.round(Math.abs(p - 0.5) * 70)}%`);
-  if (known) cell.append(element("small", {}, `${fixed(low, 2)} – ${fixed(high, 2)}`));
+  const cell = element("td", { class: sure && p > 0.5 ? "number better" : "number" }, words);
+  cell.append(element("small", {}, known ? `${fixed(low, 2)} – ${fixed(high, 2)}` : "too few seeds"));
   return cell;
 }
 
-/** Pairs of name and value, folded. */
+/** Pairs of name and value, folded; those with a default have another value than that. */
 function folded(title, rows) {
-  const pairs = element("dl", { class: "pairs" }, ...rows.map(pair));
-  return element("details", {}, element("summary", {}, `${title} (${rows.length})`), pairs);
+  const different = rows.filter(differs).length;
+  const number = different ? `${rows.length}, ${different} not the default` : String(rows.length);
+  const pairs = element("dl", { class: "pairs" }, ...rows.map(option));
+  return element("details", {}, element("summary", {}, `${title} (${number})`), pairs);
+}
+
+function differs([, , byDefault]) {
+  return byDefault !== null && byDefault !== undefined;
+}
+
+function option(row) {
+  const node = pair(row);
+  if (!differs(row)) return node;
+  node.classList.add("differs");
+  node.lastChild.append(element("small", {}, ` default ${row[2]}`));
+  return node;
 }

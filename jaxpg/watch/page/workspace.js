@@ -29,7 +29,8 @@ function drawWorkspace(data, player, state, width) {
   svg.append(label(0, 12, "start", data.y, "title"));
   inside.append(shape("circle", { class: "limit", cx: X(0), cy: Y(0), r: X(data.radius) - X(0) }));
   for (const [x, y, distance, success] of [...points].sort((a, b) => b[3] - a[3])) {
-    const words = `goal ${text(x)}, ${text(y)}: ${text(distance)} m away at the end`;
+    const end = distance === null ? ending({ success: success > 0 }) : `: ${text(distance)} m away at the end`;
+    const words = `goal ${text(x)}, ${text(y)}${end}`;
     inside.append(mark(success > 0, X(x), Y(y), 3.4, shape("title", {}, words)));
   }
   const goal = player && player.policies[state.policy].episodes[state.episode].goal;
