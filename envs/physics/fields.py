@@ -88,9 +88,7 @@ def _type_of(owner: Any, name: str) -> jax.ShapeDtypeStruct:
     return jax.ShapeDtypeStruct(shape, bool if name == "eq_active" else jnp.result_type(float))
 
 
-def as_arguments(
-    names: Sequence[str], types: Sequence[jax.ShapeDtypeStruct], values: Sequence[Any]
-) -> list[jax.Array]:
+def as_arguments(names: Sequence[str], types: Sequence[jax.ShapeDtypeStruct], values: Sequence[Any]) -> list[jax.Array]:
     """The values as arrays of the fields' types.
 
     Raises:
