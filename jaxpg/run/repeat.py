@@ -31,8 +31,7 @@ def command(config: Config) -> str:
     for _ in range(MOST):
         missing = _differences(config, _composed(given))
         if not missing:
-            program = registered.command(config.choices["env"], "train")
-            return " ".join([program, *(shlex.quote(argument(*option)) for option in given.items())])
+            return " ".join([_program(config), *(shlex.quote(argument(*option)) for option in given.items())])
         given |= missing
     raise RuntimeError(f"no command line for {given}")
 
@@ -50,6 +49,14 @@ def _differences(config: Config, other: Config) -> dict[str, Any]:
 
 def _composed(given: Mapping[str, Any]) -> Config:
     return configuration.compose([argument(name, value) for name, value in given.items()])
+
+
+def _program(config: Config) -> str:
+    """As anybody would type it: pages are sent to others, who have another interpreter."""
+    program = registered.program_of(config.choices["env"]).get(registered.PROGRAM)
+    if program is None:
+        return "python -m jaxpg.train"
+    return f"python {program if program.startswith('-m ') else shlex.quote(program)} train"
 
 
 def argument(name: str, value: Any) -> str:

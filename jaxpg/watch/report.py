@@ -183,11 +183,12 @@ def _references(
 
 
 def _configuration(config: Config) -> list[list[str | None]]:
-    """Name and value of each option, and its default where that is another."""
-    defaults = repeat.defaults(config)
+    """Name and value of each option, and its default where that is another; where the run is kept is no difference."""
+    values = configuration.named(config)
+    defaults = repeat.defaults(config) | {name: values[name] for name in repeat.NOT_REPEATED}
     return [
-        [name, str(value), None if defaults.get(name) == value else str(defaults.get(name))]
-        for name, value in configuration.named(config).items()
+        [name, str(value), None if value == defaults.get(name) else str(defaults.get(name))]
+        for name, value in values.items()
     ]
 
 

@@ -44,9 +44,8 @@ function countRows(data, player, state) {
   const head = [["goals"], [inlineMark(true), ` ${within}`], [inlineMark(false), " not"]];
   const rows = data.points.map((points, i) => {
     const reached = points.filter((point) => point[3] > 0).length;
-    const share = points.length ? ` (${fixed((100 * reached) / points.length, 1)} %)` : "";
     const name = player?.policies[i]?.label ?? `policy ${i + 1}`;
-    return [name, `${reached} of ${points.length}${share}`, String(points.length - reached)];
+    return [name, `${reached} of ${points.length}`, String(points.length - reached)];
   });
   return [
     element("tr", {}, ...head.map((words, i) => element("th", { scope: "col", class: i ? "number" : null }, ...words))),
