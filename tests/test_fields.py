@@ -90,7 +90,11 @@ def test_real_numbers_are_what_they_are_in_float32(physics):
             ("qpos",),
             "unknown input 'model.body_mas': did you mean 'model.body_mass'",
         ),
-        (("qpos", "qvel", "model.gravity"), ("qpos",), "unknown input 'model.gravity': did you mean 'model.opt.gravity'"),
+        (
+            ("qpos", "qvel", "model.gravity"),
+            ("qpos",),
+            "unknown input 'model.gravity': did you mean 'model.opt.gravity'",
+        ),
         (("qpos", "qvel", "model.opt.gravty"), ("qpos",), "did you mean 'model.opt.gravity'"),
         (("qpos", "qvel", "model.nq"), ("qpos",), "unknown input 'model.nq'"),
         (("qpos", "qvel", "qacc"), ("qpos",), "^qacc is what the step computes"),
