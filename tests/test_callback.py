@@ -329,10 +329,17 @@ def test_models_differ_as_they_do_by_mjx():
 
 
 def test_inertial_frames_that_cannot_differ_are_refused():
-    """A body alone in space has a diagonal matrix of inertia, of which MuJoCo stores no more."""
-    alone = mujoco.MjModel.from_xml_string(models.chain('<body><freejoint/><geom size="0.1"/></body>'))
-    with pytest.raises(ValueError, match=r"^model\.body_ipos: with physics 'mujoco' it cannot differ"):
-        compile_step(alone, inputs=("qpos", "qvel", "model.body_ipos"), physics="mujoco")
+    """A body alone in space has a diagonal matrix of inertia, of which MuJoCo stores no more unless it is told to."""
+    alone = models.chain('<body name="ball"><freejoint/><geom size="0.1"/></body>')
+    inputs = ("qpos", "qvel", "model.body_ipos")
+    with pytest.raises(
+        ValueError, match=r"^model\.body_ipos: .* it cannot differ .* body 'ball' needs simple=\"false\""
+    ):
+        compile_step(mujoco.MjModel.from_xml_string(alone), inputs=inputs, physics="mujoco")
+    model = mujoco.MjModel.from_xml_string(alone.replace('name="ball"', 'name="ball" simple="false"'))
+    moved = compile_step(model, inputs=inputs, outputs=("xipos",), physics="mujoco")
+    (centre,) = moved(model.qpos0, np.zeros(6), np.array([[0, 0, 0], [0.1, 0, 0]]))
+    np.testing.assert_allclose(centre[1], [0.1, 0, 0], atol=1e-6)
 
 
 def test_a_model_that_cannot_be_batched_is_named():

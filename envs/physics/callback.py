@@ -137,10 +137,13 @@ def _with_frames(model: mujoco.MjModel, fields: Sequence[str]) -> mujoco.MjModel
     """
     import mujoco.batch
 
+    simple = np.flatnonzero((model.body_simple > 0) & (model.body_dofnum > 0))
     for name in fields:
-        constant = name in SIMPLE and model.body_simple[model.body_dofnum > 0].any()
-        if constant or name not in mujoco.batch.MODEL_FIELDS:
-            raise ValueError(f"model.{name}: with physics 'mujoco' it cannot differ between environments")
+        reason = ""
+        if name in SIMPLE and simple.size:
+            reason = f' where a body is compiled as simple: body {model.body(simple[0]).name!r} needs simple="false"'
+        if reason or name not in mujoco.batch.MODEL_FIELDS:
+            raise ValueError(f"model.{name}: with physics 'mujoco' it cannot differ between environments{reason}")
     if set(fields) & {*FRAMES, *SIMPLE}:
         for flags in (model.body_sameframe, model.geom_sameframe, model.site_sameframe):
             flags[:] = mujoco.mjtSameFrame.mjSAMEFRAME_NONE
