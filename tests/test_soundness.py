@@ -264,4 +264,6 @@ def test_with_skip_it_goes_on_from_there(exploded, command):
     result = command("train", f"resume={folder}", "nan_policy=skip")
     assert "such updates are left out" in result.stdout
     assert result.returncode == 4
-    assert "the last 100 updates could not be applied" in result.stdout, "the parameters are what explodes here"
+    assert re.search(r"the last \d+ updates could not be applied", result.stdout), (
+        "the parameters are what explodes here"
+    )
