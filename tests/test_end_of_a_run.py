@@ -173,19 +173,20 @@ def test_step_sizes_follow_the_updates_and_not_the_gradient_steps():
     """One step of Adam moves a parameter by the step size; all but one of six steps are left out here."""
     config = configured(*PPO, "algo.max_kl=1e-9", "algo.final_lr=0", "algo.actor_lr=0.01")
     algorithm = make_algorithm(config, make_env(config))
-    begun = initial_state(algorithm, KEY)
 
-    step = jax.jit(algorithm.step)
+    @jax.jit
+    def after(update):
+        begun = initial_state(algorithm, jax.random.key(0))
+        state, _ = algorithm.step(begun._replace(update=update), jax.random.key(1))
+        return jax.tree.map(lambda a, b: jnp.abs(a - b).max(), state.params["actor"], begun.params["actor"])
 
     def moved(update):
-        state, _ = step(begun._replace(update=jnp.int32(update)), KEY)
-        steps = jax.tree.map(lambda a, b: float(jnp.abs(a - b).max()), state.params["actor"], begun.params["actor"])
-        return max(jax.tree.leaves(steps))
+        return max(map(float, jax.tree.leaves(after(jnp.int32(update)))))
 
     first = moved(0)
     for update in (5, 10, 15):
         np.testing.assert_allclose(moved(update) / first, 1 - update / UPDATES, rtol=1e-4)
-    assert moved(UPDATES) == moved(UPDATES + 3) == 0
+    assert max(moved(UPDATES), moved(UPDATES + 3)) < 1e-6 * first
 
 
 def test_a_longer_run_goes_on_as_if_it_had_been_that_long():

@@ -16,7 +16,7 @@ from envs.base import Interface, initial_state
 from envs.options import option
 from jaxpg import evaluate, train
 from jaxpg.run import policies
-from jaxpg.run.names import OURS, distinct, own_interface, own_metrics
+from jaxpg.run.names import OURS, numbered, own_interface, own_metrics
 from jaxpg.watch.clips import clip
 from jaxpg.watch.recording import record
 
@@ -24,13 +24,14 @@ NAMES = st.lists(st.one_of(st.sampled_from(sorted(OURS)), st.text(max_size=150),
 
 
 @given(st.lists(st.sampled_from(["a", "a (2)", "a (2) (2)", "b", ""]), max_size=8))
-def test_distinct_names_are_distinct_and_the_first_ones_stay(names):
-    found = distinct(names, taken=["b"])
+def test_numbered_names_are_distinct_and_stay_where_they_were_before(names):
+    found = numbered(names, taken=["b"])
     assert len({*found, "b"}) == len(names) + 1
-    for name, new in zip(names, found, strict=True):
-        assert new.startswith(name)
-    if names and names[0] != "b":
-        assert found[0] == names[0]
+    for i, (name, new) in enumerate(zip(names, found, strict=True), start=1):
+        assert new in (name, f"{name} ({i})")
+    if len({*names, "b"}) == len(names) + 1:
+        assert found == names
+    assert numbered(found, taken=["b"]) == found
 
 
 @given(NAMES)
@@ -54,8 +55,8 @@ def test_usual_names_stay(name):
 
 def test_names_of_an_interface_are_told_apart():
     found = own_interface(Interface(("x", "x", ""), ("torque [N m]", "torque [N m]", "value"), (1.0, 2.0, 3.0)))
-    assert found.observations == ("x", "x (2)", "observation_2")
-    assert found.commands == ("torque [N m]", "torque [N m] (2)", "value (2)")
+    assert found.observations == ("x (1)", "x (2)", "observation_2")
+    assert found.commands == ("torque [N m] (1)", "torque [N m] (2)", "value (3)")
     assert found.limits == (1.0, 2.0, 3.0)
 
 
@@ -120,7 +121,7 @@ def test_commands_with_one_name_are_a_series_each(run):
     stored = policies.load(str(run))
     (recording,) = record(stored, [stored.policy], jax.random.split(jax.random.key(0), 2))
     series = clip(stored, recording, 0).series
-    assert list(series) == ["torque", "torque (2)", "reward (2)", "reward", "value"]
-    for i, name in enumerate(["torque", "torque (2)", "reward (2)"]):
+    assert list(series) == ["torque (1)", "torque (2)", "reward (3)", "reward", "value"]
+    for i, name in enumerate(["torque (1)", "torque (2)", "reward (3)"]):
         np.testing.assert_array_equal(series[name], recording.command[:4, 0, i])
     np.testing.assert_array_equal(series["reward"], recording.reward[:4, 0])

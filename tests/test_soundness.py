@@ -89,7 +89,7 @@ def test_what_exploded_is_named_as_it_is(what):
     watch.look(state._replace(update=np.zeros(1, int)), {name: np.asarray(x)[None] for name, x in metrics.items()})
     where = " of environment 1" if what == "observation" else ""
     assert watch.problem == f"update {BAD}: {what}{where} is not finite"
-    assert not watch.nobody_goes_on
+    assert watch.nobody_goes_on, "it would make the same update again"
 
 
 def test_other_policies_are_refused():
@@ -264,4 +264,6 @@ def test_with_skip_it_goes_on_from_there(exploded, command):
     result = command("train", f"resume={folder}", "nan_policy=skip")
     assert "such updates are left out" in result.stdout
     assert result.returncode == 4
-    assert "no update after it could be applied" in result.stdout, "the parameters are what explodes here"
+    assert re.search(r"the last \d+ updates could not be applied", result.stdout), (
+        "the parameters are what explodes here"
+    )

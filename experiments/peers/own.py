@@ -42,7 +42,7 @@ def main() -> None:
     train, update = program.init().train, 0
     RECORDER.ready()
     while update < schedule.num_updates and not RECORDER.over:
-        train, _ = program.advance(train)
+        train, _ = program.advance(train, schedule.until_next_line(update))
         update = int(train.update[0])
         if RECORDER.due or update >= schedule.num_updates:
             policy = current_policy(train)

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import itertools
 import re
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 from envs.base import Interface
@@ -16,25 +17,19 @@ LONGEST = 100  # letters of a metric's name: services refuse longer ones
 SHOWN_BESIDE_COMMANDS = ("reward", "value")
 
 
-def distinct(names: Iterable[str], taken: Iterable[str] = (), form: str = "{} ({})") -> list[str]:
-    """The names, each that is there already with a number after it.
+def numbered(names: Sequence[str], taken: Sequence[str] = ()) -> list[str]:
+    """Names that tell things apart: one that is there twice, or taken, has its place after it; all, if need be.
 
-    Args:
-      names: in order.
-      taken: by others.
-      form: of a name and its number, from 2.
-
-    >>> distinct(["torque", "value", "torque"], taken=["reward", "value"])
-    ['torque', 'value (2)', 'torque (2)']
+    >>> numbered(["torque", "value", "torque"], taken=["reward", "value"])
+    ['torque (1)', 'value (2)', 'torque (3)']
+    >>> numbered(["a", "a", "a (1)"])
+    ['a (1)', 'a (2)', 'a (1) (3)']
     """
-    used, found = set(taken), []
-    for name in names:
-        new, number = name, 2
-        while new in used:
-            new, number = form.format(name, number), number + 1
-        used.add(new)
-        found.append(new)
-    return found
+    places = [f"{name} ({i})" for i, name in enumerate(names, start=1)]
+    found = [
+        place if names.count(name) > 1 or name in taken else name for name, place in zip(names, places, strict=True)
+    ]
+    return found if len({*found, *taken}) == len(found) + len(taken) else places
 
 
 def own_metrics(metrics: Mapping[str, Any]) -> dict[str, Any]:
@@ -46,15 +41,19 @@ def own_metrics(metrics: Mapping[str, Any]) -> dict[str, Any]:
     >>> own_metrics({"success": 1, "return": 2, "env_return": 3, "a b%": 4, "a b&": 5})
     {'success': 1, 'env_return': 2, 'env_env_return': 3, 'a b_': 4, 'a b__2': 5}
     """
-    names = [_apart(_plain(str(name))) for name in metrics]
-    return dict(zip(distinct(names, form="{}_{}"), metrics.values(), strict=True))
+    found: dict[str, Any] = {}
+    for name, value in metrics.items():
+        own = _apart(_plain(str(name)))
+        others = (f"{own}_{number}" for number in itertools.count(2))
+        found[next(new for new in itertools.chain([own], others) if new not in found)] = value
+    return found
 
 
 def own_interface(interface: Interface) -> Interface:
     """The interface with names that tell its numbers apart, from each other and from what is shown beside commands."""
 
     def named(names, kind, taken=()):
-        return tuple(distinct((str(name) or f"{kind}_{i}" for i, name in enumerate(names)), taken))
+        return tuple(numbered([str(name) or f"{kind}_{i}" for i, name in enumerate(names)], taken))
 
     observations = named(interface.observations, "observation")
     commands = named(interface.commands, "action", SHOWN_BESIDE_COMMANDS)

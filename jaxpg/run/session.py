@@ -212,7 +212,7 @@ def _train(session: Session, program: Program, state: RunState, compile_seconds:
     first = update = _update(state.train)
     keeper = Keeper(config, run_folder, display.say)  # before the log, which has files and processes to close
     log = MetricsLog(run_folder, update, display.say, config.run.loggers, config.num_agents)
-    watch, watchdog = Watch(config, display.say, min(PATIENCE, schedule.num_updates)), Watchdog()
+    watch, watchdog = Watch(config, display.say, min(PATIENCE, schedule.num_updates - first)), Watchdog()
     began, seconds_before = time.monotonic(), log.seconds
     display.start()
     try:

@@ -8,10 +8,11 @@ from typing import NamedTuple
 import jax
 import numpy as np
 
+from jaxpg.run.names import SHOWN_BESIDE_COMMANDS, numbered
 from jaxpg.run.policies import StoredPolicy
 from jaxpg.watch.recording import Look, Recording
 
-STEPS = ("reward", "value")  # series of every episode
+STEPS = SHOWN_BESIDE_COMMANDS  # series of every episode
 
 
 class Clip(NamedTuple):
@@ -69,11 +70,7 @@ def command_names(stored: StoredPolicy) -> list[str]:
     size, names = stored.env.action_size, [str(name) for name in stored.interface.commands]
     if len(names) != size:
         names = [f"action {i + 1}" for i in range(size)]
-    numbered = [f"{name} ({i + 1})" for i, name in enumerate(names)]
-    distinct = [
-        by if names.count(name) > 1 or name in STEPS else name for name, by in zip(names, numbered, strict=True)
-    ]
-    return distinct if len(set(distinct)) == size else numbered
+    return numbered(names, STEPS)
 
 
 def limits_of(stored: StoredPolicy) -> np.ndarray:
