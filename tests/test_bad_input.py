@@ -1,6 +1,8 @@
 """Mistakes end in one clear line, status 2, and nothing written."""
 
+import errno
 import json
+import os
 import shutil
 import sys
 
@@ -316,3 +318,21 @@ def test_a_stray_line_in_metrics_is_cut_off(finished, monkeypatch, capsys, tmp_p
     assert (status, error) == (0, "")
     lines = [json.loads(line) for line in (folder / "metrics.jsonl").read_text().splitlines()]
     assert [line["update"] for line in lines] == [1, 2]
+
+
+@pytest.mark.parametrize("number", [errno.EACCES, errno.ENAMETOOLONG, errno.EROFS, errno.ENOSPC, errno.ELOOP])
+def test_what_is_wrong_with_a_folder_is_one_line(number, monkeypatch, capsys):
+    def main(arguments):
+        raise OSError(number, os.strerror(number), "/somewhere/report.html")
+
+    status, error = run(main, [], monkeypatch, capsys)
+    assert (status, error) == (2, f"error: /somewhere/report.html: {os.strerror(number)}\n")
+
+
+@pytest.mark.parametrize("mistake", [FileNotFoundError(errno.ENOENT, "ours", "x"), OSError(errno.EACCES, "no file")])
+def test_a_mistake_of_ours_keeps_its_traceback(mistake, monkeypatch):
+    def main(arguments):
+        raise mistake
+
+    with pytest.raises(OSError, match="ours|no file"):
+        run_command(main)

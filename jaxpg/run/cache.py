@@ -45,8 +45,8 @@ REJECTED = "rejected"  # a file where the entries belong, on a machine that cann
 UNREADABLE = "Error reading persistent compilation cache entry"
 
 
-# JAX's settings, warnings and standard error, which change inside, are the process's: of several trainings in threads one
-# compiles after the other.
+# What changes inside, JAX's settings, warnings and standard error, is the process's: several trainings in threads
+# compile one after the other.
 _ALONE = threading.RLock()
 
 
