@@ -1,6 +1,8 @@
 """Mistakes end in one clear line, status 2, and nothing written."""
 
+import errno
 import json
+import os
 import shutil
 import sys
 
@@ -98,8 +100,8 @@ MISTAKES = {
     ),
     "environments beyond 32 bits": (["num_envs=1000000000000"], "must be at least 1, at most 2147483647"),
     "updates beyond 32 bits": (
-        ["algo=td", "num_envs=1", "num_steps=1", "total_steps=1e12"],
-        "total_steps=1000000000000: with 1 steps an update it must stay below 2147483647",
+        ["algo=td", "num_envs=2", "num_steps=1", "total_steps=1e12"],
+        "total_steps=1000000000000: with 2 steps an update it must stay below 4294967294",
     ),
     "gradient steps beyond 32 bits": (
         ["algo=ppo", "num_envs=512", "num_steps=30", "algo.epochs=10", "algo.minibatches=8", "total_steps=5e11"],
@@ -316,3 +318,21 @@ def test_a_stray_line_in_metrics_is_cut_off(finished, monkeypatch, capsys, tmp_p
     assert (status, error) == (0, "")
     lines = [json.loads(line) for line in (folder / "metrics.jsonl").read_text().splitlines()]
     assert [line["update"] for line in lines] == [1, 2]
+
+
+@pytest.mark.parametrize("number", [errno.EACCES, errno.ENAMETOOLONG, errno.EROFS, errno.ENOSPC, errno.ELOOP])
+def test_what_is_wrong_with_a_folder_is_one_line(number, monkeypatch, capsys):
+    def main(arguments):
+        raise OSError(number, os.strerror(number), "/somewhere/report.html")
+
+    status, error = run(main, [], monkeypatch, capsys)
+    assert (status, error) == (2, f"error: /somewhere/report.html: {os.strerror(number)}\n")
+
+
+@pytest.mark.parametrize("mistake", [FileNotFoundError(errno.ENOENT, "ours", "x"), OSError(errno.EACCES, "no file")])
+def test_a_mistake_of_ours_keeps_its_traceback(mistake, monkeypatch):
+    def main(arguments):
+        raise mistake
+
+    with pytest.raises(OSError, match=r"ours|no file"):
+        run_command(main)

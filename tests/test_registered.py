@@ -11,14 +11,16 @@ import pytest
 from environments import SIZES, Config, register
 from hydra.core.config_store import ConfigStore
 from hydra.core.global_hydra import GlobalHydra
-from processes import tree
+from processes import outcome, tree
 
 import envs
 from envs.options import OptionError, option
 from jaxpg import train
-from jaxpg.run import config
+from jaxpg.run import cache, config
 from jaxpg.run.config import compose
 from jaxpg.run.errors import run_command
+
+RUN = tuple(size for size in SIZES if not size.startswith("network"))
 
 
 def problems_of(monkeypatch, arguments=(), **entry):
@@ -216,14 +218,21 @@ def test_without_training_values_the_defaults_count_and_it_is_said(monkeypatch, 
     assert " ".join(config.load(tmp_path / "run" / "config.yaml").to_dict()["env"]) == "id speed gains episode_length"
 
 
-def test_a_training_in_a_thread(monkeypatch, tmp_path):
-    """As Optuna's jobs and a graphical program have it: Python hears signals in the main thread only."""
-    ended = []
-    arguments = ["env=quadratic", *SIZES[:-3], "env.episode_length=4", "report=false", f"run_dir={tmp_path / 'run'}"]
-    thread = threading.Thread(target=lambda: ended.append(train.main(arguments)))
-    thread.start()
-    thread.join()
-    assert ended == [0]
+def test_trainings_in_threads(monkeypatch, tmp_path):
+    """As Optuna's jobs and a graphical program have them: Python hears signals in the main thread only."""
+    monkeypatch.setattr(cache, "cache_folder", lambda: tmp_path / "cache" / "jaxpg")
+    ended = {}
+
+    def train_in(folder):
+        ended[folder.name] = train.main(["env=quadratic", "network=linear", *RUN, f"run_dir={folder}"])
+
+    threads = [threading.Thread(target=train_in, args=(tmp_path / name,)) for name in ("first", "second")]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert ended == {"first": 0, "second": 0}
+    assert outcome(tmp_path / "first") == outcome(tmp_path / "second")
 
 
 def test_under_a_program_of_hydras_its_state_stays_its_own():

@@ -21,6 +21,7 @@ import platform
 import shutil
 import stat
 import tempfile
+import threading
 import time
 import warnings
 from collections.abc import Callable, Iterator, Sequence
@@ -44,6 +45,11 @@ REJECTED = "rejected"  # a file where the entries belong, on a machine that cann
 UNREADABLE = "Error reading persistent compilation cache entry"
 
 
+# What changes inside, JAX's settings, warnings and standard error, is the process's: several trainings in threads
+# compile one after the other.
+_ALONE = threading.RLock()
+
+
 class CacheError(Exception):
     """A folder that compiled programs cannot be kept in; its text says why."""
 
@@ -59,6 +65,11 @@ def compilation_cache(enabled: bool, say: Callable[[str], None]) -> Iterator[Non
       enabled: without it nothing is read or written.
       say: takes the line, if there is something to say.
     """
+    with _ALONE:
+        yield from _cached(enabled, say)
+
+
+def _cached(enabled: bool, say: Callable[[str], None]) -> Iterator[None]:
     if not enabled or jax.config.jax_compilation_cache_dir is not None:
         with filtered():
             yield
@@ -129,7 +140,7 @@ def physics_cache(enabled: bool) -> Iterator[None]:
     if enabled:
         with contextlib.suppress(CacheError, OSError):
             texts = Texts(cache_folder())
-    with storage.kept_in(texts):
+    with _ALONE, storage.kept_in(texts):
         yield
 
 
