@@ -24,12 +24,11 @@ from jaxpg.run.folder import RunFolder, read_metrics
 
 FEW, MANY = 12, 500
 SIZES = ("env=quadratic", "network=linear", "num_envs=2", "num_steps=4", "log_interval=16", "eval_interval=32")
-RUN = (*SIZES, "eval_episodes=2", "env.episode_length=8", "checkpoint_interval=32", "report=false", "total_steps=96")
-LONGER = "total_steps=128"
+RUN = (*SIZES, "eval_episodes=2", "env.episode_length=8", "checkpoint_interval=32", "report=false", "total_steps=128")
 LAST = 128 // 8  # updates
 COMMANDS = {
-    "resume": (train, ["resume={run}", LONGER]),
-    "begin or resume": (train, [*RUN[:-1], LONGER, "run_dir={run}", "resume=auto"]),
+    "resume": (train, ["resume={run}"]),
+    "begin or resume": (train, [*RUN, "run_dir={run}", "resume=auto"]),
     "inspect": (inspect, ["run={run}"]),
     "evaluate": (evaluate, ["run={run}", "episodes=2", "checkpoint=last"]),
     "report": (report, ["run={run}"]),
@@ -43,16 +42,17 @@ OUTPUTS = ("lock", "report.html", "page.html", "learning_curve.png", "export", "
 
 @pytest.fixture(scope="module")
 def runs(tmp_path_factory):
-    """A run, another one, and what is in the end of the first when it goes on undamaged."""
+    """A run that was killed before its last checkpoint, another one, and the first as it ends undamaged."""
     folders = tmp_path_factory.mktemp("runs")
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(cache, "cache_folder", lambda: folders / "cache" / "jaxpg")
         patch.setattr(gc, "freeze", lambda: None)  # as of a process that ends
-        for name, seed in (("run", 0), ("other", 1)):
+        for name, seed in (("undisturbed", 0), ("other", 1)):
             status, _, error = ended(train.main, [*RUN, f"seed={seed}", f"run_dir={folders / name}"])
             assert status == 0, error
-        shutil.copytree(folders / "run", folders / "longer")
-        assert ended(train.main, [f"resume={folders / 'longer'}", LONGER])[0] == 0
+        shutil.copytree(folders / "undisturbed", folders / "run")
+        for name in ("run", "other"):
+            shutil.rmtree(folders / name / "checkpoints" / str(LAST))
         yield folders
 
 
@@ -134,10 +134,10 @@ def is_right(runs, run, command, status, output, error):
     assert (status, error) == (0, ""), error
     if command in ("resume", "begin or resume"):
         config, usual = (
-            configuration.named(configuration.load(path / "config.yaml")) for path in (run, runs / "longer")
+            configuration.named(configuration.load(path / "config.yaml")) for path in (run, runs / "undisturbed")
         )
         if config | {"run_dir": None} == usual | {"run_dir": None}:  # else another interval, say, which may change
-            assert digest(run) == digest(runs / "longer")
+            assert digest(run) == digest(runs / "undisturbed")
         assert [line["update"] for line in read_metrics(RunFolder(run))][-1] == LAST
 
 
