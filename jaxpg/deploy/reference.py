@@ -10,6 +10,8 @@ import numpy as np
 from jaxpg.deploy.controller import FARTHEST, Controller
 from jaxpg.features import BOUND, monomials
 
+ROWS = 500  # computed at once: some features of an observation are a hundred thousand
+
 
 def commands(controller: Controller, obs: np.ndarray, dtype: type = np.float64, stretch: float = 1.0) -> np.ndarray:
     """`[N, n]` to `[N, m]`, every operation in this precision.
@@ -24,6 +26,11 @@ def commands(controller: Controller, obs: np.ndarray, dtype: type = np.float64, 
       dtype: of the arithmetic.
       stretch: z is multiplied by it: to see how much depends on its last digits.
     """
+    parts = np.array_split(obs, max(len(obs) // ROWS, 1))
+    return np.concatenate([_commands(controller, part, dtype, stretch) for part in parts])
+
+
+def _commands(controller: Controller, obs: np.ndarray, dtype: type, stretch: float) -> np.ndarray:
     with np.errstate(all="ignore"):  # what is not finite is looked for at the end
         z = (obs.astype(dtype) - controller.mean.astype(dtype)) * controller.scale.astype(dtype) * dtype(stretch)
         x = FEATURES[controller.features](z, controller.order)
