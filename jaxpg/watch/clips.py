@@ -62,18 +62,9 @@ def clip(stored: StoredPolicy, recording: Recording, episode: int, most: int | N
 
 
 def command_names(stored: StoredPolicy) -> list[str]:
-    """A name for each command that no other series of an episode has; numbers where the environment has not as many.
-
-    Where two are the same, each has its number after it.
-    """
-    size, names = stored.env.action_size, [str(name) for name in stored.interface.commands]
-    if len(names) != size:
-        names = [f"action {i + 1}" for i in range(size)]
-    numbered = [f"{name} ({i + 1})" for i, name in enumerate(names)]
-    distinct = [
-        by if names.count(name) > 1 or name in STEPS else name for name, by in zip(names, numbered, strict=True)
-    ]
-    return distinct if len(set(distinct)) == size else numbered
+    """The name of each command, which no other series of an episode has; numbers where there are not as many names."""
+    size, names = stored.env.action_size, list(stored.interface.commands)
+    return names if len(names) == size else [f"action {i + 1}" for i in range(size)]
 
 
 def limits_of(stored: StoredPolicy) -> np.ndarray:
