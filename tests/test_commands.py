@@ -203,7 +203,7 @@ def test_a_sweep_trains_every_setting_with_every_seed(swept):
     assert len(list((folder / "checkpoints").iterdir())) == 3
     returns = np.array(metrics(folder)[-1]["eval_return"], float).reshape(6, 2)
     assert np.isnan(returns[[2, 5]]).all(), "the settings change in the order of the command line, the last one fastest"
-    rows = re.findall(r"^algo\.gamma=(\S+) algo\.actor_lr=(\S+) +(\S+)(?: \[(\S+), (\S+)\])?$", text, re.MULTILINE)
+    rows = re.findall(r"^algo\.gamma=(\S+) algo\.actor_lr=(\S+) +(\S+)(?: \((\S+) to (\S+)\))?$", text, re.MULTILINE)
     means = {(gamma, lr): mean for gamma, lr, mean, _, _ in rows}
     expected = [f"{mean:.1f}" for mean in returns.mean(axis=1)]
     settings = [(gamma, lr) for gamma in ("0.5", "0.9") for lr in ("0.001", "0.01", "1e+38")]
@@ -216,7 +216,7 @@ def test_a_sweep_trains_every_setting_with_every_seed(swept):
 
 def test_agents_of_a_sweep_are_evaluated_and_inspected_by_their_settings(swept, command):
     folder, text = swept
-    first = text[text.index("[95 % interval]:") :].splitlines()[1]
+    first = text[text.index("(lowest to highest):") :].splitlines()[1]
     assert f"best setting {re.sub(' {2,}', ': ', first)}" in command("inspect", f"run={folder}").stdout
     result = command("evaluate", f"run={folder}", "episodes=2", "agent=7")
     assert "quadratic, seed 1 algo.gamma=0.9 algo.actor_lr=0.001, best policy" in result.stdout

@@ -8,7 +8,7 @@ from typing import NamedTuple
 import jax
 import numpy as np
 
-from jaxpg.run.names import SHOWN_BESIDE_COMMANDS, numbered
+from jaxpg.run.names import SHOWN_BESIDE_COMMANDS
 from jaxpg.run.policies import StoredPolicy
 from jaxpg.watch.recording import Look, Recording
 
@@ -63,14 +63,9 @@ def clip(stored: StoredPolicy, recording: Recording, episode: int, most: int | N
 
 
 def command_names(stored: StoredPolicy) -> list[str]:
-    """A name for each command that no other series of an episode has; numbers where the environment has not as many.
-
-    Where two are the same, each has its number after it.
-    """
-    size, names = stored.env.action_size, [str(name) for name in stored.interface.commands]
-    if len(names) != size:
-        names = [f"action {i + 1}" for i in range(size)]
-    return numbered(names, STEPS)
+    """The name of each command, which no other series of an episode has; numbers where there are not as many names."""
+    size, names = stored.env.action_size, list(stored.interface.commands)
+    return names if len(names) == size else [f"action {i + 1}" for i in range(size)]
 
 
 def limits_of(stored: StoredPolicy) -> np.ndarray:
