@@ -1,9 +1,11 @@
 """What README and docs say can be done, done; the README's two set-up commands are run by `.ci/run`."""
 
+import itertools
 import re
 import shlex
 import subprocess
 import sys
+import tomllib
 from pathlib import Path
 
 import pytest
@@ -11,7 +13,7 @@ import pytest
 ROOT = Path(__file__).parent.parent
 PAGES = {path.name: path.read_text(encoding="utf-8") for path in [ROOT / "README.md", *(ROOT / "docs").glob("*.md")]}
 README = PAGES["README.md"]
-SAVED = {"own_environment.md": "balance.py"}  # pages whose first Python block is a file
+SAVED = {"own_environment.md": {0: "balance.py", 2: "unknown.py"}}  # Python blocks that are files, by their place
 PLAYED = {"policy_in_python.md", "deploy.md"}  # pages whose Python is about the run that their commands train
 SIZES = ("num_envs=2", "eval_episodes=2", "report=false")
 
@@ -42,8 +44,8 @@ def place(tmp_path, monkeypatch):
     def make(page):
         monkeypatch.chdir(ROOT if page == "README.md" else tmp_path)
         (tmp_path / "robot.xml").write_text((ROOT / "envs/assets/arm.xml").read_text())
-        if page in SAVED:
-            (tmp_path / SAVED[page]).write_text(blocks("python", page)[0])
+        for number, name in SAVED.get(page, {}).items():
+            (tmp_path / name).write_text(blocks("python", page)[number])
         return tmp_path
 
     return make
@@ -54,7 +56,9 @@ def test_python_examples_run(page, place, command_environment):
     folder = place(page)
     for line in commands(page) if page in PLAYED else []:
         run_command(line, folder, command_environment)
-    for code in blocks("python", page)[page in SAVED :]:
+    for number, code in enumerate(blocks("python", page)):
+        if number in SAVED.get(page, {}):
+            continue
         cwd = ROOT if page == "README.md" else folder
         result = subprocess.run([sys.executable, "-c", code], cwd=cwd, capture_output=True, text=True, check=False)
         assert result.returncode == 0, (code, result.stderr)
@@ -94,6 +98,30 @@ def test_no_command_is_left_out():
         assert len(commands(page)) >= 3, page
     assert len(blocks("python", "README.md")) == 3
     assert len([line for line in blocks("python", "own_environment.md")[0].splitlines() if line]) == 40
+
+
+NEEDED = {"format=all": "onnx", "format=onnx": "onnx", "policy=onnx": "onnxruntime", "backend=gymnasium": "gymnasium"}
+
+
+@pytest.mark.parametrize("page", ["README.md", "quick_start.md"])
+def test_the_set_up_installs_what_the_commands_need(page):
+    """Of every page: they are read after one of these."""
+    extras = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]["optional-dependencies"]
+    (setup,) = re.findall(r"^python3 -m venv .* -e (\S+)(?: && .*jaxpg.train.*)?$", PAGES[page], re.MULTILINE)
+    chosen = setup.strip("'").removeprefix(".").strip("[]").split(",")
+    installed = " ".join(package for extra in chosen if extra for package in extras[extra])
+    used = {name for line in itertools.chain(*map(commands, PAGES)) for name in line.split() if name in NEEDED}
+    assert used >= {"format=all", "policy=onnx", "backend=gymnasium"}
+    assert not [name for name in used if NEEDED[name] not in installed]
+
+
+def test_pages_can_be_followed_one_after_the_other():
+    """No two commands begin a run in the same folder; no command needs another Python than that of the set-up."""
+    lines = [line for page in PAGES for line in commands(page)]
+    begun = [name for line in lines if "resume=auto" not in line for name in re.findall(r" run_dir=(\S+)", line)]
+    assert len(begun) >= 6
+    assert sorted(begun) == sorted(set(begun))
+    assert all(line.startswith(".venv/bin/python ") for line in lines)
 
 
 def test_ci_runs_the_set_up_commands():

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
+from envs.physics.fields import model_fields
 from envs.physics.models import import_mjx
 
 if TYPE_CHECKING:
@@ -29,33 +30,32 @@ def differing_fields(models: Sequence[mujoco.MjModel]) -> dict[str, jax.Array]:
     Raises:
       ValueError: the models differ in more than numbers: in sizes, or in what is counted or switched.
     """
+    _check_same_structure(models)
     found = {}
-    for name in _names():
+    for name in model_fields(models[0]):
         values = [np.asarray(_value(model, name)) for model in models]
-        if any(value.shape != values[0].shape for value in values):
-            raise ValueError(f"model.{name} differs in its size: {', '.join(str(value.shape) for value in values)}")
-        if any((value != values[0]).any() for value in values):
-            if values[0].dtype.kind != "f":
-                raise ValueError(f"model.{name} differs, which is no number of the physics but its structure")
-            found[f"model.{name}"] = jnp.asarray(np.stack(values))
+        if _is_mjxs(name) and any((value != values[0]).any() for value in values):
+            found[name] = jnp.asarray(np.stack(values))
     return found
 
 
-def _names() -> Iterator[str]:
-    """Fields of `mjx.Model`, in which MJX looks for a model's numbers; `opt` and `stat` have fields of their own."""
-    import mujoco
+def _check_same_structure(models: Sequence[mujoco.MjModel]) -> None:
+    first = models[0]
+    for name in (name for name in dir(first) if not name.startswith("_")):
+        values = [np.asarray(getattr(model, name)) for model in models]
+        sized = any(value.shape != values[0].shape for value in values)
+        if sized or (values[0].dtype.kind in "iub" and any((value != values[0]).any() for value in values)):
+            raise ValueError(f"model.{name} differs, which is no number of the physics but its structure")
 
-    mjx = import_mjx()
-    for field in dataclasses.fields(mjx.Model):
-        if field.name in ("opt", "stat"):
-            kind = {"opt": mujoco.MjOption, "stat": mujoco.MjStatistic}[field.name]
-            inner = {"opt": mjx.Option, "stat": mjx.Statistic}[field.name]
-            yield from (f"{field.name}.{part.name}" for part in dataclasses.fields(inner) if hasattr(kind, part.name))
-        elif hasattr(mujoco.MjModel, field.name) and field.name not in ("names", "signature"):
-            yield field.name
+
+def _is_mjxs(name: str) -> bool:
+    """Whether MJX has such a field; what it has not, such as a tree of bounding boxes, its step does not look at."""
+    mjx, parts = import_mjx(), name.split(".")[1:]
+    owner = mjx.Option if len(parts) == 2 else mjx.Model
+    return parts[-1] in {field.name for field in dataclasses.fields(owner)}
 
 
 def _value(model: mujoco.MjModel, name: str) -> Any:
-    for part in name.split("."):
+    for part in name.split(".")[1:]:
         model = getattr(model, part)
     return model
