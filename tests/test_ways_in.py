@@ -47,10 +47,11 @@ def test_the_console_script_has_every_command(script):
     assert script("evaluate") == (2, "", "error: run=DIR is missing: the folder of a run, such as runs/pendulum\n")
 
 
-# As on Windows, where Python has no module of that name.
+# As on Windows, where Python has no such modules and names.
 WITHOUT_LOCKS = """
-import runpy, sys
-sys.modules["fcntl"] = None
+import os, runpy, sys
+sys.modules["fcntl"] = sys.modules["resource"] = None
+del os.O_DIRECTORY, os.O_NOFOLLOW
 del sys.argv[0]
 runpy.run_module(sys.argv[0], run_name="__main__", alter_sys=True)
 """

@@ -15,10 +15,8 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import BinaryIO
 
-from jaxpg.run.posix import fcntl
-
 UNFINISHED = ".unfinished"  # ends the name of a file that is renamed once it is complete
-FOLDER = os.O_RDONLY | os.O_DIRECTORY
+FOLDER = os.O_RDONLY | getattr(os, "O_DIRECTORY", 0)  # Windows, where no run is, has none
 A_LINK = "it is a link, and what is in a run folder must be its own"
 DESCRIPTORS = "/proc/self/fd"  # on Linux a path to each that is open
 NO_FILE = (errno.EINVAL, errno.ELOOP)  # of what is found where a file was expected
@@ -198,6 +196,8 @@ def _by_number(descriptor: int) -> Path:
 def _name(descriptor: int) -> Path:
     """The name that an open folder has now, as far as the system tells."""
     try:
+        from jaxpg.run.posix import fcntl  # at its use: options are read and --help is printed without it
+
         if hasattr(fcntl, "F_GETPATH"):
             return Path(os.fsdecode(fcntl.fcntl(descriptor, fcntl.F_GETPATH, bytes(1024)).rstrip(b"\0")))
         return _by_number(descriptor).readlink()
