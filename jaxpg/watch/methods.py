@@ -93,10 +93,9 @@ def methods(paths: Sequence[str]) -> list[Method]:
     Raises:
       UserError: no run folder, runs of different environments, a run twice, or one that has not been evaluated.
     """
-    agents = [agent for path in paths for agent in _agents(path)]
-    tasks = sorted({task(agent) for agent in agents})
-    if len(tasks) > 1:
-        raise UserError(f"runs of {' and '.join(tasks)}: only returns of the same environment can be compared")
+    of_runs = [list(_agents(path)) for path in paths]
+    _check_one_task([(task(agents[0]), path) for agents, path in zip(of_runs, paths, strict=True)])
+    agents = [agent for agents in of_runs for agent in agents]
     groups: dict[str, list[Agent]] = {}
     for agent in agents:
         groups.setdefault(repr({k: v for k, v in agent.options.items() if k not in SAME_METHOD}), []).append(agent)
@@ -106,6 +105,15 @@ def methods(paths: Sequence[str]) -> list[Method]:
         _check(method)
     best = sorted(standings(found), key=lambda one: -float(interquartile_mean(one.returns)))
     return [one.method for one in best]
+
+
+def _check_one_task(runs: Sequence[tuple[str, str]]) -> None:
+    tasks: dict[str, list[str]] = {}
+    for name, path in sorted(runs):
+        tasks.setdefault(name, []).append(path)
+    if len(tasks) > 1:
+        where = "; ".join(f"{name} in {', '.join(paths)}" for name, paths in tasks.items())
+        raise UserError(f"only returns of one environment can be compared: {where}")
 
 
 def compared_at(found: Sequence[Method]) -> int:
