@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from processes import RUN, outcome
+from processes import LINES, RUN, outcome
 
 from envs.base import State
 from jaxpg.rollout import rollout
@@ -263,7 +263,7 @@ def test_with_skip_it_goes_on_from_there(exploded, command):
     assert outcome(folder)[:2] == (before, update)
     result = command("train", f"resume={folder}", "nan_policy=skip")
     assert "such updates are left out" in result.stdout
-    assert result.returncode == 4
-    assert re.search(r"the last \d+ updates could not be applied", result.stdout), (
-        "the parameters are what explodes here"
-    )
+    assert result.returncode == 0, "some of the updates after it are finite"
+    lines, number, _ = outcome(folder)
+    assert number == 2 * LINES
+    assert sum(line["skipped"] for line in lines) > 0

@@ -191,7 +191,7 @@ def _compile(session: Session, env: Any, resumed: bool = False) -> tuple[Program
     name = f"{what} {config.num_shards} {config.run.vmap_seeds} {resumed}"
     with (
         timed(config.run.cache, name) as before,
-        display.working(f"compiling the updates and evaluations of {what} ({before})"),
+        display.working(f"compiling {what} ({before})"),
         compilation_cache(config.run.cache, display.say),
     ):
         program = compile_program(config, env, session.schedule.chunk, resumed=resumed, meanwhile=_import_the_rest)
