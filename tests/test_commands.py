@@ -146,7 +146,7 @@ def test_evaluation_of_a_run(uninterrupted, command):
         assert result.returncode == 0, result.stderr
         assert result.stderr == ""
     answers = [json.loads(result.stdout.splitlines()[-1]) for result in results]
-    assert set(answers[0]) == {"mean", "stderr", "episodes", "success"}
+    assert set(answers[0]) == {"mean", "stderr", "episodes", "success", "diverged"}
     assert answers[0]["episodes"] == 8
     assert -2000 < answers[0]["mean"] < 0
     assert answers[0] == answers[1], "the same seed gives the same starts"

@@ -40,7 +40,8 @@ class Interrupts:
         self._ended.set()
         if self._handles:
             signal.signal(signal.SIGINT, self._before)
-            sys.unraisablehook = self._hook
+            if sys.unraisablehook == self._dropped:  # or another hook has come meanwhile, which hands on to it
+                sys.unraisablehook = self._hook
         if self._heard and kind is not KeyboardInterrupt:
             raise KeyboardInterrupt
 
@@ -55,7 +56,7 @@ class Interrupts:
             os.kill(os.getpid(), signal.SIGINT)
 
     def _dropped(self, unraisable: Any) -> None:
-        if unraisable.exc_type is not KeyboardInterrupt:
+        if self._ended.is_set() or unraisable.exc_type is not KeyboardInterrupt:
             self._hook(unraisable)
 
 

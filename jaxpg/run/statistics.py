@@ -150,8 +150,8 @@ def probability_of_improvement(x: np.ndarray, y: np.ndarray) -> float:
     >>> probability_of_improvement(np.array([1.0, 2.0]), np.array([1.0, 0.0]))
     0.875
     """
-    difference = np.asarray(x, float)[:, None] - np.asarray(y, float)
-    return float(np.mean((np.sign(difference) + 1) / 2))
+    x, y = np.asarray(x, float)[:, None], np.asarray(y, float)
+    return float(np.mean((x > y) + (x == y) / 2))
 
 
 def improvement_interval(x: np.ndarray, y: np.ndarray, confidence: float = CONFIDENCE) -> tuple[float, float]:
