@@ -65,7 +65,7 @@ def compile_step(
       A function of the inputs (SI units; ctrl in the actuators' units) of one environment, in jax's default precision.
       A NaN in the state stays in the state. By "mujoco" all that is returned of an environment is NaN where it has
       diverged, as `callback_step` says. The function raises ValueError for a shape, and TypeError for a dtype or a
-        number of arguments, that does not fit the inputs.
+      number of arguments, that does not fit the inputs.
 
     Raises:
       ValueError: a name is unknown (with the nearest one), is not what a step is a function of, or cannot differ
