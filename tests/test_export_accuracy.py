@@ -2,7 +2,9 @@
 
 import itertools
 import math
+import re
 
+import exploding  # noqa: F401, which registers environments
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -205,3 +207,19 @@ def test_what_is_tried_is_said(export):
         f"tried      on 10,000 observations, {len(played(stored)):,} of them played and the others drawn; "
         "errors in units of the limit, against float64"
     )
+
+
+LEARNER = ("env=exploding-servo", "env.growth=1e4", "algo=online", "algo.actor_lr=1e-4", "algo.critic_lr=1e-4")
+LEARNER += ("network=linear", "network.features=identity", "network.sigma_is=fixed")
+
+
+@pytest.mark.parametrize(
+    ("share", "said_of_the_learner"),
+    [
+        (0.5, r"in learning differs from JAX by \S+ at most, \d{3} updates"),
+        (1.0, "in learning not tried: the physics of all episodes diverges"),
+    ],
+)
+def test_a_learner_is_tried_on_sound_episodes(share, said_of_the_learner, export, tmp_path):
+    assert re.fullmatch(f" +{said_of_the_learner}", export(a_policy(*LEARNER, f"env.share={share}")).splitlines()[-1])
+    assert (tmp_path / "out" / "learn.c").exists()

@@ -124,8 +124,7 @@ def export(options: ExportOptions, say: Callable[[str], None]) -> None:
             written += paths
             say(f"{name:<10} error {error:.1e} at most: {' '.join(str(out / path.name) for path in paths)}")
             if name == "c" and control.learner:
-                apart = _learning_difference(stored, control, Path(place))
-                say(f"{'':<10} in learning differs from JAX by {apart:.1e} at most, {learning.NUM_STEPS:,} updates")
+                say(f"{'':<10} {_try_learner(stored, control, Path(place))}")
         if not options.overwrite:
             sealing.check_replaceable([path.name for path in written], out)
         sealing.move(written, out)
@@ -155,23 +154,26 @@ def _checked(control: Controller, what: str, tried: Trial, commands: np.ndarray)
     return error
 
 
-def _learning_difference(stored: StoredPolicy, control: Controller, place: Path) -> float:
-    """How far the parameters of the written learner are from JAX's at most, after any of the same steps.
+def _try_learner(stored: StoredPolicy, control: Controller, place: Path) -> str:
+    """How far the parameters of the written learner are from JAX's at most, after any of the same steps, in words.
 
     Raises:
       UserError: further than it may be.
     """
     transition = learning.steps(stored)
+    updates = len(transition.reward)
+    if not updates:
+        return "in learning not tried: the physics of all episodes diverges"
     networks = make_networks(stored.config, stored.env)
     expected = learning.learned(networks, control.learner.options, stored.policy, control.learner.log_std, transition)
     found = c.program(control, place / "learn.c")(learning.rows(transition))
     difference = largest_difference(found, np.asarray(expected))
     if not difference <= LEARNING_TOLERANCE:
         raise UserError(
-            f"format=c: its learner's parameters differ from JAX's by {difference:.1e} after {learning.NUM_STEPS:,} "
-            f"updates, more than {LEARNING_TOLERANCE:.0e}; nothing is written"
+            f"format=c: its learner's parameters differ from JAX's by {difference:.1e} after {updates:,} updates, more "
+            f"than {LEARNING_TOLERANCE:.0e}; nothing is written"
         )
-    return difference
+    return f"in learning differs from JAX by {difference:.1e} at most, {updates:,} updates"
 
 
 @contextlib.contextmanager

@@ -21,7 +21,10 @@ NUM_STEPS = 1000
 
 
 def steps(stored: StoredPolicy) -> Transition:
-    """Steps of one environment under the policy with its noise, `[T, 1, ...]`; no episode whose physics diverges."""
+    """Steps of one environment under the policy with its noise, `[T, 1, ...]`, T <= `NUM_STEPS`.
+
+    Episodes that nothing would be learned from (`jaxpg.actor_critic.learned_from`) are left out.
+    """
     networks = make_networks(stored.config, stored.env)
     vector = vectorize(stored.env, 1, stored.config.env.episode_length)
     key_reset, key_rollout = jax.random.split(jax.random.key(1))
