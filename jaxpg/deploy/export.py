@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import functools
 import importlib
 import tempfile
 from collections.abc import Callable, Iterator
@@ -157,23 +158,31 @@ def _checked(control: Controller, what: str, tried: Trial, commands: np.ndarray)
 def _try_learner(stored: StoredPolicy, control: Controller, place: Path) -> str:
     """How far the parameters of the written learner are from JAX's at most, after any of the same steps, in words.
 
+    The tolerance is `LEARNING_TOLERANCE`, or `STEEP` times what rounding makes of the steps so far where that is more:
+    nothing bounds a step, and where the learning itself runs away floats come no closer.
+
     Raises:
       UserError: further than it may be.
     """
     transition = learning.steps(stored)
-    updates = len(transition.reward)
-    if not updates:
+    if not len(transition.reward):
         return "in learning not tried: the physics of all episodes diverges"
-    networks = make_networks(stored.config, stored.env)
-    expected = learning.learned(networks, control.learner.options, stored.policy, control.learner.log_std, transition)
-    found = c.program(control, place / "learn.c")(learning.rows(transition))
-    difference = largest_difference(found, np.asarray(expected))
-    if not difference <= LEARNING_TOLERANCE:
+    networks, learner = make_networks(stored.config, stored.env), control.learner
+    learned = functools.partial(learning.learned, networks, learner.options, stored.policy, learner.log_std)
+    expected = np.asarray(learned(transition))
+    errors = learning.differences(c.program(control, place / "learn.c")(learning.rows(transition)), expected)
+    tolerance = np.maximum(LEARNING_TOLERANCE, STEEP * learning.rounding(learned, transition, expected))
+    wrong = np.flatnonzero(~(errors <= tolerance) & np.isfinite(tolerance))
+    if wrong.size:
         raise UserError(
-            f"format=c: its learner's parameters differ from JAX's by {difference:.1e} after {updates:,} updates, more "
-            f"than {LEARNING_TOLERANCE:.0e}; nothing is written"
+            f"format=c: its learner's parameters differ from JAX's by {errors[wrong[0]]:.1e} after update "
+            f"{wrong[0] + 1:,}, more than {tolerance[wrong[0]]:.0e}; nothing is written"
         )
-    return f"in learning differs from JAX by {difference:.1e} at most, {updates:,} updates"
+    exact = int(np.sum(tolerance <= LEARNING_TOLERANCE))
+    later = f"; in the {len(errors) - exact:,} after these rounding may make more" if exact < len(errors) else ""
+    return (
+        f"in learning differs from JAX by {np.max(errors[:exact], initial=0.0):.1e} at most, {exact:,} updates{later}"
+    )
 
 
 @contextlib.contextmanager
@@ -213,12 +222,3 @@ def origin(options: ExportOptions, stored: StoredPolicy) -> dict[str, str]:
         "run": run_folder.path.resolve().name,
         "digest": Checkpoints(which, read_only=True).digest(stored.update),
     }
-
-
-def largest_difference(found: np.ndarray, expected: np.ndarray) -> float:
-    """max |a - b| / max(1, |b|): absolute for small commands, relative for large ones; NaN if there is one.
-
-    >>> largest_difference(np.array([1.5, 200.0]), np.array([1.0, 100.0]))
-    1.0
-    """
-    return float(np.max(np.abs(found - expected) / np.maximum(1, np.abs(expected))))

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -77,3 +79,34 @@ def learned(
         return jax.lax.scan(step, (params, traces), transition)[1]
 
     return jax.jit(learn)(policy.params, transition)
+
+
+def differences(found: np.ndarray, expected: np.ndarray) -> np.ndarray:
+    """max |a - b| / max(1, |b|) over the parameters after each step, `[T, P]` to `[T]`; NaN if there is one.
+
+    >>> differences(np.array([[1.5, 200.0]]), np.array([[1.0, 100.0]])).tolist()
+    [1.0]
+    """
+    with np.errstate(all="ignore"):  # numbers that have run away
+        return np.max(np.abs(found - expected) / np.maximum(1, np.abs(expected)), axis=1)
+
+
+def rounding(learn: Callable[[Transition], jax.Array], transition: Transition, expected: np.ndarray) -> np.ndarray:
+    """What float arithmetic may have made of the parameters after each step, `[T]`, as `differences`.
+
+    It is the largest so far of the differences that the same steps make with every number changed in the last digit of
+    a float32; infinite from the step on after which there is a number that is not finite.
+
+    Args:
+      learn: `learn(transition) -> parameters`, `[T, P]`.
+      transition: the steps.
+      expected: what is learned from them.
+    """
+    epsilon = float(np.finfo(np.float32).eps)
+
+    def changed(factor):
+        numbers = {name: factor * getattr(transition, name) for name in ("obs", "u", "reward", "next_obs")}
+        return np.asarray(learn(transition._replace(**numbers)))
+
+    apart = np.maximum(*(differences(changed(1 + sign * epsilon), expected) for sign in (-1, 1)))
+    return np.maximum.accumulate(np.where(np.isnan(apart), np.inf, apart))
