@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import math
 import subprocess
 import sys
 import time
@@ -43,6 +44,17 @@ def count(text: str) -> int:
     if not (text.isascii() and text.isdigit() and int(text)):
         raise argparse.ArgumentTypeError(f"{text}: expected a whole number, at least 1")
     return int(text)
+
+
+def duration(text: str) -> float:
+    """Seconds, as the type of an argument."""
+    try:
+        seconds = float(text)
+    except ValueError:
+        seconds = math.nan
+    if not 0 < seconds < math.inf:
+        raise argparse.ArgumentTypeError(f"{text}: expected seconds, above 0")
+    return seconds
 
 
 def largest_difference(found: np.ndarray, expected: np.ndarray) -> float:

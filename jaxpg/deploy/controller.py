@@ -151,7 +151,7 @@ def _check_numbers(made: Controller) -> None:
     numbers = {"observation statistics": [made.mean, made.scale], "network": jax.tree.leaves(made.layers)}
     for name, arrays in (numbers | {"limits": [limits or 0.0]}).items():
         if not all(np.all(np.isfinite(array)) for array in arrays):
-            raise UserError(f"the policy cannot leave the library: its {name} holds numbers that are not finite")
+            raise UserError(f"the policy cannot leave the library: in its {name} are numbers that are not finite")
 
 
 def _learner(stored: StoredPolicy) -> Learner | None:
