@@ -8,9 +8,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxpg.actor_critic import learned_from, sampling_policy
+from jaxpg import divergence
+from jaxpg.actor_critic import sampling_policy
 from jaxpg.networks import Networks, linear_mean
-from jaxpg.online import Traces, trace_update
+from jaxpg.online import Traces, learnable, trace_update
 from jaxpg.rollout import rollout
 from jaxpg.run.policies import StoredPolicy
 from jaxpg.run.program import make_networks
@@ -25,7 +26,7 @@ NUM_STEPS = 1000
 def steps(stored: StoredPolicy) -> Transition:
     """Steps of one environment under the policy with its noise, `[T, 1, ...]`, T <= `NUM_STEPS`.
 
-    Episodes that nothing would be learned from (`jaxpg.actor_critic.learned_from`) are left out.
+    Episodes with a step that would not be learned from (`jaxpg.online.learnable`) are left out, up to that step.
     """
     networks = make_networks(stored.config, stored.env)
     vector = vectorize(stored.env, 1, stored.config.env.episode_length)
@@ -37,7 +38,8 @@ def steps(stored: StoredPolicy) -> Transition:
         return rollout(act, vector.step, vector.reset(key_reset), key_rollout, NUM_STEPS)[1]
 
     transition = play(stored.policy)
-    counts = np.asarray(learned_from(transition, stored.policy.normalizer))[:, 0]
+    sound = learnable(transition, stored.policy.normalizer, stored.config.algo.normalize_observations)
+    counts = np.asarray(divergence.lasting(~sound, transition.ended))[:, 0]
     return jax.tree.map(lambda x: x[counts], transition)
 
 
