@@ -166,7 +166,7 @@ def _try_learner(stored: StoredPolicy, control: Controller, place: Path) -> str:
     """
     transition = learning.steps(stored)
     if not len(transition.reward):
-        return "in learning not tried: the physics of all episodes diverges"
+        return "in learning not tried: none of the episodes played would be learned from"
     networks, learner = make_networks(stored.config, stored.env), control.learner
     learned = functools.partial(learning.learned, networks, learner.options, stored.policy, learner.log_std)
     expected = np.asarray(learned(transition))
