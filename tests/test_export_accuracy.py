@@ -13,6 +13,7 @@ from stored import a_policy
 
 from envs.base import Interface, initial_state
 from jaxpg import export as command_line
+from jaxpg import normalization
 from jaxpg.deploy import header, online, reference
 from jaxpg.deploy.controller import controller, observations, played
 from jaxpg.deploy.export import FORMATS, TOLERANCE, trial
@@ -198,6 +199,17 @@ def test_a_constant_observation_is_played(variance):
     np.testing.assert_array_equal(rows[:5000], np.stack([np.full(5000, 1.5), steps], axis=1))
     assert len(played(stored)) == 5000
     assert np.ptp(rows[5000:, 1]) > 100  # those are drawn
+
+
+def test_observations_that_training_took_as_they_are_are_played_too():
+    """Far from 0, where nothing is known of their deviation."""
+    stored = a_policy("env=quadratic", "env.state_size=2", "algo.normalize_observations=false")
+    interface = Interface(("constant", "count"), ("u",), None)
+    policy = stored.policy._replace(normalizer=normalization.init(2))
+    rows = observations(stored._replace(env=Counting(), interface=interface, policy=policy))
+    np.testing.assert_array_equal(rows[:5000, 1], np.repeat(np.arange(100.0), 50))
+    np.testing.assert_array_equal(rows[:, 0], 1.5)
+    assert rows[5000:, 1].mean() == pytest.approx(49.5, abs=4)  # standard error 0.8
 
 
 def test_what_is_tried_is_said(export):

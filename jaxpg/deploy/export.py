@@ -15,7 +15,7 @@ import numpy as np
 
 from envs.hints import pip_install
 from jaxpg.deploy import c, learning, onnx, reference, sealing, stablehlo
-from jaxpg.deploy.controller import NUM_OBSERVATIONS, Controller, commanding, controller, drawn, played
+from jaxpg.deploy.controller import Controller, commanding, controller, drawn, played
 from jaxpg.run import folder, policies
 from jaxpg.run.agents import described
 from jaxpg.run.cache import physics_cache
@@ -114,7 +114,7 @@ def export(options: ExportOptions, say: Callable[[str], None]) -> None:
         stored = policies.load(options.run, options.checkpoint, options.agent)
     control, command = controller(stored, origin(options, stored), options.name), jax.jit(commanding(stored))
     seen = played(stored)
-    tried = trial(control, np.concatenate([seen, drawn(stored, NUM_OBSERVATIONS - len(seen))]))
+    tried = trial(control, np.concatenate([seen, drawn(stored, seen)]))
     _say_what_is_tried(control, tried, len(seen), say)
     say(f"{'jax':<10} error {_checked(control, 'jax', tried, np.asarray(command(tried.obs))):.1e} at most")
     with tempfile.TemporaryDirectory() as place:
