@@ -11,6 +11,7 @@ is not needed for them. Time limits are not the environment's business: `done` i
 
 from __future__ import annotations
 
+import dataclasses
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -116,6 +117,11 @@ class MjxEnv:
     def scene(self) -> Scene:
         """How a state looks; a subclass whose state has no `qpos`, or that has a goal, says so."""
         return Scene(self.model, lambda state: state.pipeline_state.qpos)
+
+
+def with_fields(state: Any, **values: Any) -> Any:
+    """The State with other values in some of its fields; it is a named tuple or a dataclass, whosever."""
+    return state._replace(**values) if hasattr(state, "_replace") else dataclasses.replace(state, **values)
 
 
 def initial_state(pipeline_state: Any, obs: jax.Array, metric_names: tuple[str, ...] = ()) -> State:

@@ -7,7 +7,6 @@ floating point here, and here only: everything behind it takes what `envs.base.S
 
 from __future__ import annotations
 
-import dataclasses
 import math
 import operator
 import re
@@ -17,7 +16,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from envs.base import Interface, interface
+from envs.base import Interface, interface, with_fields
 from envs.options import OptionError
 from envs.user_code import user_code
 
@@ -88,8 +87,9 @@ class Converted:
 
 
 def _cast(state: Any, types: Mapping[str, Any]) -> Any:
-    values = {field: jax.tree.map(jnp.asarray, getattr(state, field), types[field]) for field in MEASURED}
-    return state._replace(**values) if hasattr(state, "_replace") else dataclasses.replace(state, **values)
+    return with_fields(
+        state, **{field: jax.tree.map(jnp.asarray, getattr(state, field), types[field]) for field in MEASURED}
+    )
 
 
 def _types(state: Any) -> dict[str, Any]:

@@ -27,7 +27,7 @@ from gymnasium.vector import AutoresetMode
 from gymnasium.vector.utils import batch_space
 
 import envs
-from envs.base import interface
+from envs.base import interface, with_fields
 from envs.options import OptionError, build
 
 LARGEST = 1e10  # as in training, after MuJoCo's mjMAXVAL
@@ -177,7 +177,8 @@ def finite_step(env: Any, state: Any, action: jax.Array) -> Any:
     """
     after = env.step(state, action)
     sound = (jnp.abs(after.obs) <= LARGEST).all() & (jnp.abs(after.reward) <= LARGEST) & jnp.isfinite(after.done)
-    return after.replace(
+    return with_fields(
+        after,
         obs=jnp.where(sound, after.obs, state.obs),
         reward=jnp.where(sound, after.reward, 0.0),
         done=jnp.where(sound, after.done, 1.0),

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import argparse
 import json
+import math
 import subprocess
 import sys
 import time
 from pathlib import Path
 from typing import Any, NoReturn
 
+import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
@@ -42,6 +44,26 @@ def count(text: str) -> int:
     if not (text.isascii() and text.isdigit() and int(text)):
         raise argparse.ArgumentTypeError(f"{text}: expected a whole number, at least 1")
     return int(text)
+
+
+def duration(text: str) -> float:
+    """Seconds, as the type of an argument."""
+    try:
+        seconds = float(text)
+    except ValueError:
+        seconds = math.nan
+    if not 0 < seconds < math.inf:
+        raise argparse.ArgumentTypeError(f"{text}: expected seconds, above 0")
+    return seconds
+
+
+def largest_difference(found: np.ndarray, expected: np.ndarray) -> float:
+    """max |a - b| / max(1, |b|): absolute for small commands, relative for large ones; NaN if there is one.
+
+    >>> largest_difference(np.array([1.5, 200.0]), np.array([1.0, 100.0]))
+    1.0
+    """
+    return float(np.max(np.abs(found - expected) / np.maximum(1, np.abs(expected))))
 
 
 def train(folder: Path, *arguments: str, environment: dict[str, str] | None = None) -> float:

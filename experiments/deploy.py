@@ -23,11 +23,11 @@ from typing import Any
 
 import jax
 import numpy as np
-from commands import Parser, evaluate, train, write_json
+from commands import Parser, evaluate, largest_difference, train, write_json
 
 from jaxpg.deploy import c, onnx
 from jaxpg.deploy.controller import commanding, controller, observations
-from jaxpg.deploy.export import FORMATS, largest_difference
+from jaxpg.deploy.export import FORMATS
 from jaxpg.run import policies
 from jaxpg.run.errors import run_command
 

@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from commands import Parser, write_figure, write_json
+from commands import Parser, duration, write_figure, write_json
 from matplotlib.figure import Figure
 
 from jaxpg.run.config import compose
@@ -79,7 +79,7 @@ def draw(result: dict[str, Any]) -> Figure:
 
 def main(arguments: Sequence[str]) -> None:
     parser = Parser(__doc__)
-    parser.add_argument("--seconds", type=float, default=3600)
+    parser.add_argument("--seconds", type=duration, default=3600)
     parser.add_argument("options", nargs="*", metavar="OPTION=VALUE")
     given = parser.parse_args(arguments)
     compose([f"env={TASK}", *given.options])  # a mistake in one of them is said here

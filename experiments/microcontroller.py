@@ -29,11 +29,10 @@ from typing import Any, NamedTuple
 
 import jax
 import numpy as np
-from commands import Parser, train, write_json
+from commands import Parser, largest_difference, train, write_json
 
 from jaxpg.deploy import c, learning
 from jaxpg.deploy.controller import Controller, commanding, controller, observations
-from jaxpg.deploy.export import largest_difference
 from jaxpg.run import policies
 from jaxpg.run.errors import UserError, run_command
 from jaxpg.run.policies import StoredPolicy

@@ -145,8 +145,8 @@ def actor_critic(
       reward_scale: factor on the rewards that the estimator and the critic see; reported returns are not scaled.
       entropy_coef: weight of the policy's entropy; of a squashed one estimated by its samples.
       normalize_observations: feed the networks (s - mean) / std with running statistics, updated after each step.
-        Episodes whose physics diverges in the rollout, or is about to, are left out of them and of what is learned
-        (`learned_from`); where nothing is left, the parameters stay as they are.
+        Episodes whose physics diverges in the rollout are left out of them. What is learned leaves out these and those
+        that are about to diverge (`learned_from`); where nothing is left, the parameters stay as they are.
       normalize_advantages: mean 0 and standard deviation 1 over the rollout.
       axis_name: a mapped axis, along which further parts of the agent's environments are (`jaxpg.shards`); not with
         `reinforce`, whose baselines and masks are of one part.

@@ -102,7 +102,7 @@ def online_actor_critic(
             policy_fn = sampling_policy(networks, params, state.normalizer)
             env_state, transition = rollout(policy_fn, env.step, env_state, key, length=1)
             transition = jax.tree.map(lambda x: x[0], transition)
-            counts = learned_from(transition, state.normalizer, normalize_observations)
+            counts = learnable(transition, state.normalizer, normalize_observations)
             params, traces, metrics = update(params, traces, state.normalizer, transition, counts)
             return (params, traces, env_state), (transition, metrics)
 
@@ -168,8 +168,8 @@ def trace_update(
     return update
 
 
-def learned_from(transition: Transition, normalizer: PyTree, normalized: bool) -> jax.Array:
-    """Which environments' steps are learned from, `[N]` of bool; arguments as in `online_actor_critic`."""
+def learnable(transition: Transition, normalizer: PyTree, normalized: bool) -> jax.Array:
+    """Which steps are learned from, `[..., N]` of bool; `normalized` is `normalize_observations`, as above."""
     sound = (transition.diverged == 0) & jnp.all(jnp.isfinite(transition.u), axis=-1)
     if not normalized:
         return sound

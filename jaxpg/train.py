@@ -25,7 +25,7 @@ def main(arguments: Sequence[str]) -> int:
         return session.resume(given)
     asked = config.compose(arguments)
     if asked.choices["algo"] not in envs.find(asked.choices["env"]).training:
-        print(f"env={asked.choices['env']} has no training values for algo={asked.choices['algo']}: the defaults count")
+        print(f"env={asked.choices['env']} has no training values for algo={asked.choices['algo']}: the defaults apply")
     return session.begin(asked)
 
 

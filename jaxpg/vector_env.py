@@ -127,7 +127,7 @@ def episode_metrics(transition: Transition, axis_name: str | None = None) -> Met
     """What a rollout says of its episodes.
 
     `episodes` that ended and `return_sum`, the sum of their returns; `diverged`, how often the physics did, and
-    `diverged_env`, the first environment with it, or -1. Episodes that ended so are not among the first.
+    `diverged_env`, the first environment with it, or -1. An episode that diverged is in neither of the first two.
 
     Args:
       transition: of a rollout.

@@ -4,6 +4,7 @@ import inspect
 import re
 import sys
 from pathlib import Path
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -17,6 +18,7 @@ from hypothesis import strategies as st
 import envs
 from envs.base import Interface, State, interface
 from envs.contract import conform
+from envs.gymnasium_env import Single
 from envs.options import OptionError
 from jaxpg import train
 from jaxpg.run.errors import run_command
@@ -248,8 +250,43 @@ def test_limits_of_any_kind_become_plain_numbers(as_kind, limits):
     assert all(type(limit) is float for limit in plain.limits)
 
 
-def test_a_metric_in_states_of_other_libraries(monkeypatch):
-    """A State that is a named tuple, and one that is somebody's dataclass with more in it."""
+class Tuple(NamedTuple):
+    """A State without brax's `replace`."""
+
+    pipeline_state: jax.Array
+    obs: jax.Array
+    reward: jax.Array
+    done: jax.Array
+    metrics: dict[str, jax.Array]
+
+
+class OfTuples:
+    observation_size = action_size = 1
+
+    def reset(self, rng):
+        return Tuple(ONE, ONE[None], 0 * ONE, ONE > 2, {})
+
+    def step(self, state, action):
+        x = state.pipeline_state + action[0]
+        return Tuple(x, x[None], -(x**2), x > 2, {})
+
+
+def test_a_state_may_be_a_named_tuple(monkeypatch):
+    register(monkeypatch, "odd", lambda config: OfTuples())
+    env = envs.make("odd")
+    states = [env.reset(jax.random.key(0))]
+    states += [env.step(states[0], jnp.full(1, action)) for action in (0.5, 1.5)]
+    assert [float(state.obs[0]) for state in states] == [1.0, 1.5, 2.5]
+    assert [(float(state.done), state.done.dtype) for state in states] == [
+        (end, jnp.float32) for end in (0.0, 0.0, 1.0)
+    ]
+    played = Single(env)
+    assert played.reset()[0] == 1.0
+    assert played.step(np.full(1, 0.5, np.float32))[:3] == (1.5, -2.25, False)
+
+
+def test_what_else_a_state_of_somebodys_own_holds_must_stay_alike(monkeypatch):
+    """A dataclass with a field more, whose name begins as that of another."""
 
     @struct.dataclass
     class Own:

@@ -68,6 +68,8 @@ MISTAKES = {
     "default_runs.py pendulm": "unknown task 'pendulm': did you mean 'pendulum'?; default_runs.py --help says more",
     "sweep.py --draws 0 env=arm": "argument --draws: 0: expected a whole number, at least 1; sweep.py --help says more",
     "sweep.py env=arm algo.gama=1": "unknown option 'algo.gama': did you mean 'algo.gamma'?",
+    "endurance.py --seconds 0": "argument --seconds: 0: expected seconds, above 0; endurance.py --help says more",
+    "endurance.py --seconds nan": "argument --seconds: nan: expected seconds, above 0; endurance.py --help says more",
     "endurance.py num_envz=3": "unknown option 'num_envz': did you mean 'num_envs'?",
     "peers/sb3.py algo=ppo": "out=... is missing; --help says more",
     "peers/sb3.py alg=ppo out=x": "unknown argument 'alg'; --help says more",

@@ -2,7 +2,9 @@
 
 import itertools
 import math
+import re
 
+import exploding  # noqa: F401, which registers environments
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -11,7 +13,8 @@ from stored import a_policy
 
 from envs.base import Interface, initial_state
 from jaxpg import export as command_line
-from jaxpg.deploy import header, reference
+from jaxpg import normalization
+from jaxpg.deploy import header, online, reference
 from jaxpg.deploy.controller import controller, observations, played
 from jaxpg.deploy.export import FORMATS, TOLERANCE, trial
 from jaxpg.features import FEATURES
@@ -198,6 +201,17 @@ def test_a_constant_observation_is_played(variance):
     assert np.ptp(rows[5000:, 1]) > 100  # those are drawn
 
 
+def test_observations_that_training_took_as_they_are_are_played_too():
+    """Far from 0, where nothing is known of their deviation."""
+    stored = a_policy("env=quadratic", "env.state_size=2", "algo.normalize_observations=false")
+    interface = Interface(("constant", "count"), ("u",), None)
+    policy = stored.policy._replace(normalizer=normalization.init(2))
+    rows = observations(stored._replace(env=Counting(), interface=interface, policy=policy))
+    np.testing.assert_array_equal(rows[:5000, 1], np.repeat(np.arange(100.0), 50))
+    np.testing.assert_array_equal(rows[:, 0], 1.5)
+    assert rows[5000:, 1].mean() == pytest.approx(49.5, abs=4)  # standard error 0.8
+
+
 def test_what_is_tried_is_said(export):
     stored = a_policy(*PENDULUM)
     said = export(stored).splitlines()[1]
@@ -205,3 +219,40 @@ def test_what_is_tried_is_said(export):
         f"tried      on 10,000 observations, {len(played(stored)):,} of them played and the others drawn; "
         "errors in units of the limit, against float64"
     )
+
+
+# --- going on with learning -------------------------------------------------------------------------------------------
+
+LEARNER = ("env=exploding-servo", "env.growth=1e4", "algo=online", "network=linear", "network.features=identity")
+SLOWEST = ("algo.actor_lr=1e-14", "algo.critic_lr=1e-14")
+SLOW = ("algo.actor_lr=1e-4", "algo.critic_lr=1e-4")
+CALM = "network.sigma_is=fixed"
+TRIED = {  # share of the episodes that explode, and what is said; a sigma that is learned from them runs away
+    "some explode": (("env.share=0.5", CALM, *SLOW), r"differs from JAX by \d\.\de-0[5-9] at most, \d{3} updates"),
+    "observations far from 0, as they are": (
+        ("env.share=0", "env.unit=1e3", "algo.normalize_observations=false", CALM, *SLOWEST),
+        r"differs from JAX by \S+ at most, 1,000 updates",
+    ),
+    "all explode": (("env.share=1", CALM, *SLOW), "not tried: none of the episodes played would be learned from"),
+    "it runs away": (
+        ("env.share=0", *SLOW),
+        r"differs from JAX by \d\.\de-0[5-9] at most, \d{2,3} updates; in the \d{3} after these rounding may make more",
+    ),
+}
+
+
+@pytest.mark.parametrize("name", TRIED)
+def test_a_learner_is_tried_as_far_as_floats_tell(name, export, tmp_path):
+    options, said = TRIED[name]
+    assert re.fullmatch(f" +in learning {said}", export(a_policy(*LEARNER, *options)).splitlines()[-1])
+    assert (tmp_path / "out" / "learn.c").exists()
+
+
+def test_a_learner_that_learns_something_else_is_not_written(export, monkeypatch, tmp_path):
+    """Nor where the right one runs away."""
+    slight = online.CODE.replace("+= step_critic * z->value_bias", "+= (policy_real)1.01 * step_critic * z->value_bias")
+    assert slight != online.CODE
+    monkeypatch.setattr(online, "CODE", slight)
+    with pytest.raises(UserError, match=r"format=c: its learner's parameters differ from JAX's by .* after update \d"):
+        export(a_policy(*LEARNER, *SLOW, "env.share=0"))
+    assert not (tmp_path / "out").exists()

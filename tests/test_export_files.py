@@ -248,7 +248,7 @@ def test_limits_of_any_sequence(limits, tmp_path):
         (Interface(("x", "y"), ("u",), (1.0,)), r"interface\.observations has 2 entries, and must have 1"),
         (Interface(("x",), (), (1.0,)), r"interface\.commands has 0 entries"),
         (Interface(("x",), ("u",), (1.0, 2.0)), r"interface\.limits has 2 entries"),
-        (Interface(("x",), ("u",), (np.nan,)), "limits holds numbers that are not finite"),
+        (Interface(("x",), ("u",), (np.nan,)), "in its limits are numbers that are not finite"),
     ],
 )
 def test_an_interface_that_does_not_fit_is_one_line(interface, message):
@@ -259,5 +259,5 @@ def test_an_interface_that_does_not_fit_is_one_line(interface, message):
 def test_a_policy_of_nan_is_one_line():
     stored = a_policy(*OPTIONS)
     normalizer = stored.policy.normalizer._replace(mean=np.array([np.nan], np.float32))
-    with pytest.raises(UserError, match="its observation statistics holds numbers that are not finite"):
+    with pytest.raises(UserError, match="in its observation statistics are numbers that are not finite"):
         controller(stored._replace(policy=stored.policy._replace(normalizer=normalizer)), {})

@@ -209,12 +209,12 @@ def trained(monkeypatch, capsys, folder, *arguments):
     return ending.value.code, capsys.readouterr().out
 
 
-def test_without_training_values_the_defaults_count_and_it_is_said(monkeypatch, capsys, tmp_path):
+def test_without_training_values_the_defaults_apply_and_it_is_said(monkeypatch, capsys, tmp_path):
     register(monkeypatch, "odd", config=Unfrozen)
     assert compose(["env=odd"]).choices["algo"] == "td"
     status, output = trained(monkeypatch, capsys, tmp_path / "run", "env=odd")
     assert status == 0
-    assert "env=odd has no training values for algo=td: the defaults count" in output
+    assert "env=odd has no training values for algo=td: the defaults apply" in output
     assert " ".join(config.load(tmp_path / "run" / "config.yaml").to_dict()["env"]) == "id speed gains episode_length"
 
 

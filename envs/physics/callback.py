@@ -82,7 +82,6 @@ class Simulations:
         self._num_substeps, self._inputs, self._outputs = num_substeps, inputs, outputs
         self._rank = len(types_of(model, inputs[:1])[0].shape)
         self._initial = _initial_state(self._model)
-        self._diverged = [int(getattr(mujoco.mjtWarning, name)) for name in DIVERGED]
         self._batch = functools.lru_cache(maxsize=KEPT)(self._new_batch)
         self._lock = threading.Lock()
         try:
@@ -114,7 +113,7 @@ class Simulations:
             _field(batch, name)[...] = values
         sound = np.all([_sound(name, values) for name, values in zip(self._inputs, rows, strict=True)], 0)
         batch.step(sound, self._num_substeps)
-        sound &= (batch.warning[:, self._diverged, 1] == COUNTED).all(1)
+        sound &= ~has_diverged(batch.warning[..., 1])
         for name, result in zip(self._outputs, results, strict=True):
             result = result.reshape(len(sound), -1)
             result[...] = _field(batch, name)
@@ -156,6 +155,14 @@ def _sound(name: str, values: np.ndarray) -> np.ndarray:
 
     within = np.abs(values) <= mujoco.mjMAXVAL if name in ("qpos", "qvel") else ~np.isnan(values)
     return within.all(1)
+
+
+def has_diverged(counts: np.ndarray) -> np.ndarray:
+    """Whether MuJoCo says so, by its counts of warnings `[..., kinds]`, all of which began with `COUNTED`."""
+    import mujoco
+
+    kinds = [int(getattr(mujoco.mjtWarning, name)) for name in DIVERGED]
+    return (counts[..., kinds] != COUNTED).any(-1)
 
 
 def _field(batch: mujoco.batch.Batch, name: str) -> np.ndarray:

@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from envs.physics.callback import COUNTED, DIVERGED
+from envs.physics.callback import COUNTED, has_diverged
 from envs.physics.models import compile_model, ignored_features, load_spec, model_digest, model_name
 from envs.physics.step import compile_step
 
@@ -71,7 +71,7 @@ def check_model(model: mujoco.MjModel, num_steps: int = 50, tolerance: float = 1
         data.ctrl[:] = limit * random.uniform(-1, 1, model.nu)
         ours = step(*ours, jnp.asarray(data.ctrl))
         mujoco.mj_step(model, data)
-        if np.any(data.warning.number[[int(getattr(mujoco.mjtWarning, name)) for name in DIVERGED]] != COUNTED):
+        if has_diverged(data.warning.number):
             return [*lines, f"C MuJoCo's own motion diverges in step {number}: the timestep is too long for it"]
         for name, mine in zip(state[:2], ours, strict=False):
             true = getattr(data, name)

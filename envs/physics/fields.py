@@ -36,10 +36,10 @@ def check_names(model: mujoco.MjModel, inputs: Sequence[str], outputs: Sequence[
             if name in OUTPUTS and name not in INPUTS:
                 raise ValueError(f"{name} is what the step computes; it is a function of {', '.join(INPUTS)}")
         if name not in known:
-            raise ValueError(unknown("input", name, known))
+            raise ValueError(_unknown("input", name, known))
     for name in outputs:
         if name not in OUTPUTS:
-            raise ValueError(unknown("output", name, OUTPUTS))
+            raise ValueError(_unknown("output", name, OUTPUTS))
     if not inputs:
         raise ValueError(f"a step is a function of some of {', '.join(INPUTS)}; the inputs name none")
     for names in (inputs, outputs):
@@ -50,7 +50,7 @@ def check_names(model: mujoco.MjModel, inputs: Sequence[str], outputs: Sequence[
         raise ValueError(f"the model has {model.na} actuator activation states, which the inputs {inputs} do not carry")
 
 
-def unknown(kind: str, name: str, known: Collection[str]) -> str:
+def _unknown(kind: str, name: str, known: Collection[str]) -> str:
     """One line for a name that there is not, with the nearest one that there is."""
     (nearest,) = difflib.get_close_matches(name, known, n=1, cutoff=0)
     return f"unknown {kind} '{name}': did you mean '{nearest}'?"

@@ -17,7 +17,7 @@ import jax
 import jax.numpy as jnp
 
 from envs.physics.callback import callback_step
-from envs.physics.fields import MODEL, STATE, as_arguments, check_names, types_of, unknown
+from envs.physics.fields import MODEL, STATE, as_arguments, check_names, types_of
 from envs.physics.interpreter import Program, trace
 from envs.physics.models import import_mjx, model_digest, model_name, put_model
 from envs.physics.obstacles import likely_obstacles, obstacles
@@ -65,7 +65,7 @@ def compile_step(
       A function of the inputs (SI units; ctrl in the actuators' units) of one environment, in jax's default precision.
       A NaN in the state stays in the state. By "mujoco" all that is returned of an environment is NaN where it has
       diverged, as `callback_step` says. The function raises ValueError for a shape, and TypeError for a dtype or a
-        number of arguments, that does not fit the inputs.
+      number of arguments, that does not fit the inputs.
 
     Raises:
       ValueError: a name is unknown (with the nearest one), is not what a step is a function of, or cannot differ
@@ -147,12 +147,12 @@ def single_step(model: mujoco.MjModel, inputs: tuple[str, ...], outputs: tuple[s
 
 
 def _check_model_fields(mjx_model, inputs: tuple[str, ...]) -> None:
-    """Raises ValueError, with the nearest name, for a field of the model that is a constant to MJX."""
+    """Raises ValueError for a field of the model that is a constant to MJX."""
     paths = [path for path, _ in jax.tree_util.tree_leaves_with_path(mjx_model)]
     known = [MODEL + jax.tree_util.keystr(path, simple=True, separator=".") for path in paths]
     for name in inputs:
         if name.startswith(MODEL) and name not in known:
-            raise ValueError(f"MJX does not compute with a changed {name}; {unknown('input', name, known)}")
+            raise ValueError(f"MJX does not compute with a changed {name}: it cannot be an input")
 
 
 def _field(owner, name: str) -> jax.Array:

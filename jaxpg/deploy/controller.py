@@ -151,7 +151,7 @@ def _check_numbers(made: Controller) -> None:
     numbers = {"observation statistics": [made.mean, made.scale], "network": jax.tree.leaves(made.layers)}
     for name, arrays in (numbers | {"limits": [limits or 0.0]}).items():
         if not all(np.all(np.isfinite(array)) for array in arrays):
-            raise UserError(f"the policy cannot leave the library: its {name} holds numbers that are not finite")
+            raise UserError(f"the policy cannot leave the library: in its {name} are numbers that are not finite")
 
 
 def _learner(stored: StoredPolicy) -> Learner | None:
@@ -198,13 +198,14 @@ def physical(interface: Interface, action: jax.Array) -> jax.Array:
 def observations(stored: StoredPolicy) -> np.ndarray:
     """What the controller is tried on, `[10000, n]`: what it sees as it plays, and others that are drawn."""
     seen = played(stored)
-    return np.concatenate([seen, drawn(stored, NUM_OBSERVATIONS - len(seen))])
+    return np.concatenate([seen, drawn(stored, seen)])
 
 
 def played(stored: StoredPolicy) -> np.ndarray:
     """What the controller sees in 5,000 steps of its own, `[<= 5000, n]`.
 
-    Rows further than `FAR` deviations from training's mean, as a controller plays that diverges, are left out.
+    Rows further than `FAR` deviations from training's mean, as a controller plays that diverges, are left out; where
+    training took the observations as they are, rows that are not valid.
     """
     length = NUM_OBSERVATIONS // 2 // NUM_EPISODES
     keys = jax.random.split(jax.random.key(0), NUM_EPISODES)
@@ -214,17 +215,24 @@ def played(stored: StoredPolicy) -> np.ndarray:
         act = functools.partial(stored.act, policy)
         return play(stored.env, act, keys, length, lambda step: (step.before.obs, step.alive))[1]
 
-    mean, deviation = _scatter(stored)
     obs, alive = (np.asarray(x) for x in seen_by(stored.policy))
     seen = obs[alive].astype(np.float32)
+    if not stored.policy.normalizer.count:
+        return seen[np.all(np.abs(seen) <= FARTHEST, axis=1)]
+    mean, deviation = _scatter(stored)
     last_digits = 1e-6 * np.abs(mean)  # a constant's mean is the constant but for these
     return seen[np.all(np.abs(seen - mean) <= FAR * deviation + last_digits, axis=1)]
 
 
-def drawn(stored: StoredPolicy, number: int) -> np.ndarray:
-    """Observations around training's mean, with twice its deviation, `[number, n]`."""
+def drawn(stored: StoredPolicy, seen: np.ndarray) -> np.ndarray:
+    """Observations around training's mean, with twice its deviation; with those that were seen they are 10,000.
+
+    Where training took the observations as they are, around those that were seen, if there are some.
+    """
     mean, deviation = _scatter(stored)
-    noise = np.asarray(jax.random.normal(jax.random.key(1), (number, len(mean))))
+    if not stored.policy.normalizer.count and len(seen):
+        mean, deviation = seen.mean(axis=0), seen.std(axis=0)
+    noise = np.asarray(jax.random.normal(jax.random.key(1), (NUM_OBSERVATIONS - len(seen), len(mean))))
     return (mean + 2 * deviation * noise).astype(np.float32)
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import functools
 import importlib
 import tempfile
 from collections.abc import Callable, Iterator
@@ -14,7 +15,7 @@ import numpy as np
 
 from envs.hints import pip_install
 from jaxpg.deploy import c, learning, onnx, reference, sealing, stablehlo
-from jaxpg.deploy.controller import NUM_OBSERVATIONS, Controller, commanding, controller, drawn, played
+from jaxpg.deploy.controller import Controller, commanding, controller, drawn, played
 from jaxpg.run import folder, policies
 from jaxpg.run.agents import described
 from jaxpg.run.cache import physics_cache
@@ -113,7 +114,7 @@ def export(options: ExportOptions, say: Callable[[str], None]) -> None:
         stored = policies.load(options.run, options.checkpoint, options.agent)
     control, command = controller(stored, origin(options, stored), options.name), jax.jit(commanding(stored))
     seen = played(stored)
-    tried = trial(control, np.concatenate([seen, drawn(stored, NUM_OBSERVATIONS - len(seen))]))
+    tried = trial(control, np.concatenate([seen, drawn(stored, seen)]))
     _say_what_is_tried(control, tried, len(seen), say)
     say(f"{'jax':<10} error {_checked(control, 'jax', tried, np.asarray(command(tried.obs))):.1e} at most")
     with tempfile.TemporaryDirectory() as place:
@@ -124,8 +125,7 @@ def export(options: ExportOptions, say: Callable[[str], None]) -> None:
             written += paths
             say(f"{name:<10} error {error:.1e} at most: {' '.join(str(out / path.name) for path in paths)}")
             if name == "c" and control.learner:
-                apart = _learning_difference(stored, control, Path(place))
-                say(f"{'':<10} in learning differs from JAX by {apart:.1e} at most, {learning.NUM_STEPS:,} updates")
+                say(f"{'':<10} {_try_learner(stored, control, Path(place))}")
         if not options.overwrite:
             sealing.check_replaceable([path.name for path in written], out)
         sealing.move(written, out)
@@ -155,23 +155,34 @@ def _checked(control: Controller, what: str, tried: Trial, commands: np.ndarray)
     return error
 
 
-def _learning_difference(stored: StoredPolicy, control: Controller, place: Path) -> float:
-    """How far the parameters of the written learner are from JAX's at most, after any of the same steps.
+def _try_learner(stored: StoredPolicy, control: Controller, place: Path) -> str:
+    """How far the parameters of the written learner are from JAX's at most, after any of the same steps, in words.
+
+    The tolerance is `LEARNING_TOLERANCE`, or `STEEP` times what rounding makes of the steps so far where that is more:
+    nothing bounds a step, and where the learning itself runs away floats come no closer.
 
     Raises:
       UserError: further than it may be.
     """
     transition = learning.steps(stored)
-    networks = make_networks(stored.config, stored.env)
-    expected = learning.learned(networks, control.learner.options, stored.policy, control.learner.log_std, transition)
-    found = c.program(control, place / "learn.c")(learning.rows(transition))
-    difference = largest_difference(found, np.asarray(expected))
-    if not difference <= LEARNING_TOLERANCE:
+    if not len(transition.reward):
+        return "in learning not tried: none of the episodes played would be learned from"
+    networks, learner = make_networks(stored.config, stored.env), control.learner
+    learned = functools.partial(learning.learned, networks, learner.options, stored.policy, learner.log_std)
+    expected = np.asarray(learned(transition))
+    errors = learning.differences(c.program(control, place / "learn.c")(learning.rows(transition)), expected)
+    tolerance = np.maximum(LEARNING_TOLERANCE, STEEP * learning.rounding(learned, transition, expected))
+    wrong = np.flatnonzero(~(errors <= tolerance) & np.isfinite(tolerance))
+    if wrong.size:
         raise UserError(
-            f"format=c: its learner's parameters differ from JAX's by {difference:.1e} after {learning.NUM_STEPS:,} "
-            f"updates, more than {LEARNING_TOLERANCE:.0e}; nothing is written"
+            f"format=c: its learner's parameters differ from JAX's by {errors[wrong[0]]:.1e} after update "
+            f"{wrong[0] + 1:,}, more than {tolerance[wrong[0]]:.0e}; nothing is written"
         )
-    return difference
+    exact = int(np.sum(tolerance <= LEARNING_TOLERANCE))
+    later = f"; in the {len(errors) - exact:,} after these rounding may make more" if exact < len(errors) else ""
+    return (
+        f"in learning differs from JAX by {np.max(errors[:exact], initial=0.0):.1e} at most, {exact:,} updates{later}"
+    )
 
 
 @contextlib.contextmanager
@@ -211,12 +222,3 @@ def origin(options: ExportOptions, stored: StoredPolicy) -> dict[str, str]:
         "run": run_folder.path.resolve().name,
         "digest": Checkpoints(which, read_only=True).digest(stored.update),
     }
-
-
-def largest_difference(found: np.ndarray, expected: np.ndarray) -> float:
-    """max |a - b| / max(1, |b|): absolute for small commands, relative for large ones; NaN if there is one.
-
-    >>> largest_difference(np.array([1.5, 200.0]), np.array([1.0, 100.0]))
-    1.0
-    """
-    return float(np.max(np.abs(found - expected) / np.maximum(1, np.abs(expected))))

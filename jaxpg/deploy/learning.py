@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxpg.actor_critic import learned_from, sampling_policy
+from jaxpg import divergence
+from jaxpg.actor_critic import sampling_policy
 from jaxpg.networks import Networks, linear_mean
-from jaxpg.online import Traces, trace_update
+from jaxpg.online import Traces, learnable, trace_update
 from jaxpg.rollout import rollout
 from jaxpg.run.policies import StoredPolicy
 from jaxpg.run.program import make_networks
@@ -21,7 +24,10 @@ NUM_STEPS = 1000
 
 
 def steps(stored: StoredPolicy) -> Transition:
-    """Steps of one environment under the policy with its noise, `[T, 1, ...]`; no episode whose physics diverges."""
+    """Steps of one environment under the policy with its noise, `[T, 1, ...]`, T <= `NUM_STEPS`.
+
+    Episodes with a step that would not be learned from (`jaxpg.online.learnable`) are left out, up to that step.
+    """
     networks = make_networks(stored.config, stored.env)
     vector = vectorize(stored.env, 1, stored.config.env.episode_length)
     key_reset, key_rollout = jax.random.split(jax.random.key(1))
@@ -32,7 +38,8 @@ def steps(stored: StoredPolicy) -> Transition:
         return rollout(act, vector.step, vector.reset(key_reset), key_rollout, NUM_STEPS)[1]
 
     transition = play(stored.policy)
-    counts = np.asarray(learned_from(transition, stored.policy.normalizer))[:, 0]
+    sound = learnable(transition, stored.policy.normalizer, stored.config.algo.normalize_observations)
+    counts = np.asarray(divergence.lasting(~sound, transition.ended))[:, 0]
     return jax.tree.map(lambda x: x[counts], transition)
 
 
@@ -74,3 +81,34 @@ def learned(
         return jax.lax.scan(step, (params, traces), transition)[1]
 
     return jax.jit(learn)(policy.params, transition)
+
+
+def differences(found: np.ndarray, expected: np.ndarray) -> np.ndarray:
+    """max |a - b| / max(1, |b|) over the parameters after each step, `[T, P]` to `[T]`; NaN if there is one.
+
+    >>> differences(np.array([[1.5, 200.0]]), np.array([[1.0, 100.0]])).tolist()
+    [1.0]
+    """
+    with np.errstate(all="ignore"):  # numbers that have run away
+        return np.max(np.abs(found - expected) / np.maximum(1, np.abs(expected)), axis=1)
+
+
+def rounding(learn: Callable[[Transition], jax.Array], transition: Transition, expected: np.ndarray) -> np.ndarray:
+    """What float arithmetic may have made of the parameters after each step, `[T]`, as `differences`.
+
+    It is the largest so far of the differences that the same steps make with every number changed in the last digit of
+    a float32; infinite from the step on after which there is a number that is not finite.
+
+    Args:
+      learn: `learn(transition) -> parameters`, `[T, P]`.
+      transition: the steps.
+      expected: what is learned from them.
+    """
+    epsilon = float(np.finfo(np.float32).eps)
+
+    def changed(factor):
+        numbers = {name: factor * getattr(transition, name) for name in ("obs", "u", "reward", "next_obs")}
+        return np.asarray(learn(transition._replace(**numbers)))
+
+    apart = np.maximum(*(differences(changed(1 + sign * epsilon), expected) for sign in (-1, 1)))
+    return np.maximum.accumulate(np.where(np.isnan(apart), np.inf, apart))

@@ -10,7 +10,7 @@ import numpy as np
 from jaxpg.deploy.controller import FARTHEST, Controller
 from jaxpg.features import BOUND, monomials
 
-ROWS = 500  # computed at once: some features of an observation are a hundred thousand
+ROWS = 500  # computed at once: an observation may have ten thousand features
 
 
 def commands(controller: Controller, obs: np.ndarray, dtype: type = np.float64, stretch: float = 1.0) -> np.ndarray:

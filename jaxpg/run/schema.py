@@ -208,7 +208,7 @@ class EvaluateOptions:
     )
     agent: int | None = option(None, "which of several agents, from 0 [default: the best]", at_least=0)
     cache: bool = option(True, "keep the compiled program in the user's cache folder, for the next evaluation")
-    json: bool = option(False, "end with one line of JSON: mean, stderr, episodes, success")
+    json: bool = option(False, "end with one line of JSON: mean, stderr, success, episodes, diverged")
 
 
 @dataclass(frozen=True)
