@@ -31,6 +31,7 @@ from envs.base import interface, with_fields
 from envs.options import OptionError, build
 
 LARGEST = 1e10  # as in training, after MuJoCo's mjMAXVAL
+KEPT = 8  # environments that are shared
 
 
 class Single(gymnasium.Env):
@@ -244,10 +245,17 @@ def _built(name: str, render_mode: str | None, options: dict[str, Any]) -> tuple
     return _shared(name, config), BOUNDS[name](config) if name in BOUNDS else None
 
 
-@functools.lru_cache(maxsize=8)
+_made: dict[tuple[str, str], Any] = {}  # by name and options, the oldest first
+
+
 def _shared(name: str, config: Any) -> Any:
     """One environment for all that ask for the same options, so that its functions are compiled once."""
-    return envs.of_config(name, config)
+    key = name, repr(config)  # which is not hashable itself where it holds lists, or is not frozen
+    if key not in _made:
+        _made[key] = envs.of_config(name, config)
+        if len(_made) > KEPT:
+            del _made[next(iter(_made))]
+    return _made[key]
 
 
 # What is known of the magnitude of the observations, by the environment's name: cosines and sines, and clipped speeds.

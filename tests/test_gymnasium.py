@@ -1,5 +1,6 @@
 """The environments as Gymnasium's: what its own tools see, one by one and as a batch."""
 
+import dataclasses
 import subprocess
 import sys
 import warnings
@@ -16,8 +17,8 @@ from probes import Counter
 
 import envs
 import jaxpg.gymnasium
-from envs.gymnasium_env import Batch, Single
-from envs.options import OptionError
+from envs.gymnasium_env import Batch, Single, make
+from envs.options import OptionError, option
 
 ROOT = Path(__file__).parent.parent
 PENDULUM, ARM = "jaxpg/Pendulum-v0", "jaxpg/Arm-v0"
@@ -224,3 +225,17 @@ def test_misuse_is_named():
     batch.reset(seed=[1, None])
     with pytest.raises(ValueError, match="shape"):
         batch.step(np.zeros(2))
+
+
+@dataclasses.dataclass(frozen=True)
+class OddConfig(envs.REGISTRY["quadratic"].config):
+    """Has a list, so that it is no key of a dictionary."""
+
+    weights: list[float] = option([1.0], "of nothing")
+
+
+def test_environments_of_equal_options_are_one_also_where_an_option_is_a_list(monkeypatch):
+    monkeypatch.setitem(envs.REGISTRY, "odd", envs.Entry(OddConfig, envs.REGISTRY["quadratic"].build, {}))
+    first, second, other = (make("odd", weights=weights).env for weights in ([1.0], [1.0], [2.0]))
+    assert first is second
+    assert first is not other
