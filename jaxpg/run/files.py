@@ -95,7 +95,7 @@ def opened(folder: Path, make: bool = False) -> Iterator[int]:
 
 def open_folder(folder: Path, make: bool = False) -> int:
     """As `opened`; to be closed."""
-    for root, owner in _owned.items():
+    for root, owner in tuple(_owned.items()):  # other threads may begin and end runs meanwhile
         if Path(os.path.abspath(folder)).is_relative_to(root):
             return _open_own(os.path.relpath(folder, root), owner, make)
     if all(os.path.lexists(folder.parent / name) for name in ("config.yaml", "best")):
