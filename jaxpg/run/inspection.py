@@ -9,6 +9,7 @@ from jaxpg.run import config as configuration
 from jaxpg.run.checkpoint import CheckpointError, Checkpoints
 from jaxpg.run.config import Config
 from jaxpg.run.folder import RunFolder, jsonable
+from jaxpg.run.lines import up_to
 from jaxpg.run.program import Schedule, plan
 from jaxpg.run.results import best_returns, table
 from jaxpg.run.runtime import prepare
@@ -62,6 +63,7 @@ def inspect(path: str) -> Inspection:
     sound = [number for number, problem in checkpoints.items() if problem is None]
     update = sound[0] if sound else 0
     schedule = plan(config)
+    best_of_checkpoint = best_returns(up_to(lines, update))
     before = folder.read_versions(run_folder)
     return Inspection(
         run_folder=run_folder,
@@ -69,7 +71,7 @@ def inspect(path: str) -> Inspection:
         checkpoints=checkpoints,
         update=update,
         schedule=schedule,
-        finished=bool(sound) and (update >= schedule.num_updates or is_solved(config.run, best_returns(lines))),
+        finished=bool(sound) and (update >= schedule.num_updates or is_solved(config.run, best_of_checkpoint)),
         owner=lock.owner(run_folder.path),
         digest=stored.digest(update) if sound else None,
         lines=lines,

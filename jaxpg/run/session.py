@@ -25,6 +25,7 @@ from jaxpg.run.config import Config
 from jaxpg.run.errors import UserError
 from jaxpg.run.folder import RunFolder, jsonable
 from jaxpg.run.keeper import Keeper
+from jaxpg.run.lines import up_to
 from jaxpg.run.loggers import follower
 from jaxpg.run.metrics_log import MetricsLog
 from jaxpg.run.names import own_metrics
@@ -153,7 +154,8 @@ def _go_on(stored: Config, config: Config, run_folder: RunFolder) -> int:
         _draw(session)
         display.say(f"{run_folder.path} is finished; a larger total_steps goes on")
         return 0
-    if is_solved(config.run, results.best_returns(folder.read_metrics(run_folder, config.num_agents))):
+    lines = up_to(folder.read_metrics(run_folder, config.num_agents), update)
+    if is_solved(config.run, results.best_returns(lines)):
         display.say(f"{run_folder.path} has reached stop_return={config.run.stop_return:g}; a higher one goes on")
         return 0
     display.say(
