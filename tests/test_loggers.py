@@ -79,7 +79,9 @@ def _this_process_is_not_a_sender():
 @pytest.fixture
 def run_folder(tmp_path):
     (tmp_path / "run").mkdir()
-    (tmp_path / "run" / "config.yaml").write_text("program: /home/me/robot.py\nseed: 3\nenv:\n  id: pendulum\n  mass: 1e-3\n")
+    (tmp_path / "run" / "config.yaml").write_text(
+        "program: /home/me/robot.py\nseed: 3\nenv:\n  id: pendulum\n  mass: 1e-3\n"
+    )
     return RunFolder(tmp_path / "run")
 
 

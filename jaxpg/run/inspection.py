@@ -10,10 +10,10 @@ from jaxpg.run.checkpoint import CheckpointError, Checkpoints
 from jaxpg.run.config import Config
 from jaxpg.run.folder import RunFolder, jsonable
 from jaxpg.run.lines import up_to
+from jaxpg.run.loop import is_solved
 from jaxpg.run.program import Schedule, plan
 from jaxpg.run.results import best_returns, table
 from jaxpg.run.runtime import prepare
-from jaxpg.run.session import is_solved
 from jaxpg.run.terminal import shown
 
 
