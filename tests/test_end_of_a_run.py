@@ -15,7 +15,8 @@ from jaxpg import train
 from jaxpg.run import program, session
 from jaxpg.run.chunks import PATIENCE, Watch
 from jaxpg.run.config import compose
-from jaxpg.run.program import compile_program, described_jump, make_algorithm, make_env, plan
+from jaxpg.run.program import compile_program, make_algorithm, make_env
+from jaxpg.run.schedule import described_jump, plan
 from jaxpg.training import initial_state, train_chunk, train_scan
 from jaxpg.types import Algorithm, TrainState
 

@@ -11,9 +11,9 @@ from jaxpg.run.config import Config
 from jaxpg.run.folder import RunFolder, jsonable
 from jaxpg.run.lines import up_to
 from jaxpg.run.loop import is_solved
-from jaxpg.run.program import Schedule, plan
 from jaxpg.run.results import best_returns, table
 from jaxpg.run.runtime import prepare
+from jaxpg.run.schedule import Schedule, plan
 from jaxpg.run.terminal import shown
 
 

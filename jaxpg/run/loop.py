@@ -14,7 +14,8 @@ from jaxpg.run.folder import RunFolder, jsonable
 from jaxpg.run.keeper import Keeper
 from jaxpg.run.metrics_log import MetricsLog
 from jaxpg.run.names import own_metrics
-from jaxpg.run.program import Program, Schedule
+from jaxpg.run.program import Program
+from jaxpg.run.schedule import Schedule
 from jaxpg.run.schema import Run
 from jaxpg.run.signals import StopRequests
 from jaxpg.run.state import Best, RunState, better, current_policy

@@ -28,6 +28,7 @@ from jaxpg.networks import Networks, linear_networks, mlp_networks
 from jaxpg.online import online_actor_critic
 from jaxpg.run.agents import Agents, agents_of, with_values
 from jaxpg.run.config import Config
+from jaxpg.run.schedule import plan
 from jaxpg.run.state import Policy, RunState, current_policy, is_key, start
 from jaxpg.run.versions import num_threads
 from jaxpg.soundness import sound
@@ -40,35 +41,6 @@ SELECTION_SEED = 2**31
 # Of LLVM. With 3, XLA's default, a training compiles a quarter longer and runs no faster.
 OPTIMIZED, RUN_ONCE = ({"xla_backend_optimization_level": level} for level in (2, 0))
 MAX_FEATURES = 10_000  # a grid over many observations is soon beyond any memory
-
-
-class Schedule(NamedTuple):
-    """How the updates are divided; the host looks between chunks only.
-
-    Attributes:
-      steps_per_update: environment steps of one update (of each agent).
-      chunk: updates between two lines of metrics, which come after each multiple of it and after the last update.
-      num_updates: updates of the whole run, however it is divided.
-      eval_every, checkpoint_every: in chunks.
-    """
-
-    steps_per_update: int
-    chunk: int
-    num_updates: int
-    eval_every: int
-    checkpoint_every: int
-
-    @property
-    def total_steps(self) -> int:
-        return self.num_updates * self.steps_per_update
-
-    def is_due(self, update: int, every: int) -> bool:
-        """Whether something done every `every` chunks is due after `update` updates; at the end it always is."""
-        return update >= self.num_updates or update % (self.chunk * every) == 0
-
-    def until_next_line(self, update: int) -> int:
-        """Updates from `update` to the next line of metrics; also from within a chunk, where a run may have stopped."""
-        return min(self.chunk - update % self.chunk, self.num_updates - update)
 
 
 class Program(NamedTuple):
@@ -85,47 +57,6 @@ class Program(NamedTuple):
     advance: Callable[..., tuple[TrainState, Metrics]]
     evaluate: Callable[[Policy], Episodes]
     state_shape: RunState
-
-
-def plan(config: Config) -> Schedule:
-    """The updates of a run: its steps rounded up to whole updates, and intervals to whole updates and chunks."""
-    run = config.run
-    steps_per_update = run.num_envs * run.num_steps
-    num_updates = _ceil(run.total_steps, steps_per_update)
-    chunk = min(_ceil(run.log_interval, steps_per_update), num_updates)
-    return Schedule(
-        steps_per_update=steps_per_update,
-        chunk=chunk,
-        num_updates=num_updates,
-        eval_every=_ceil(run.eval_interval, chunk * steps_per_update),
-        checkpoint_every=_ceil(run.checkpoint_interval, chunk * steps_per_update),
-    )
-
-
-def described_jump(before: Config, after: Config, update: int) -> str | None:
-    """What jumps where a run goes on with another total, in words; None where nothing does.
-
-    Step sizes and sigma are at any update where a run of the new total, asked for from the beginning, has them.
-
-    Args:
-      before, after: the configuration up to now and from now on.
-      update: updates made.
-    """
-    was, now = (min(update / plan(config).num_updates, 1.0) for config in (before, after))
-    if was == now:
-        return None
-    jumps = []
-    final_lr, network = getattr(after.algo, "final_lr", 1.0), after.network
-    if "algo.final_lr" in after.sweep:
-        jumps.append("step sizes jump")
-    elif final_lr != 1:
-        shares = [f"{1 - (1 - final_lr) * progress:.1%}" for progress in (now, was)]
-        jumps.append(f"step sizes are {shares[0]} of the first, not {shares[1]}")
-    if network.sigma_is == "scheduled":
-        ratio = network.final_sigma / network.sigma
-        sigmas = [f"{network.sigma * ratio**progress:.3g}" for progress in (now, was)]
-        jumps.append(f"sigma is {sigmas[0]}, not {sigmas[1]}")
-    return f"from here on as in a run of {plan(after).total_steps:,} steps: {'; '.join(jumps)}" if jumps else None
 
 
 def make_env(config: Config) -> Any:
@@ -417,7 +348,3 @@ def in_groups(compiled: Compiled, size: int, at_once: int) -> Callable:
 def _on_host(x: Any) -> Any:
     """As a numpy array, which is divided without compiling anything; random keys stay what they are."""
     return x if is_key(x) else np.asarray(x)
-
-
-def _ceil(a: int, b: int) -> int:
-    return -(-a // b)

@@ -23,8 +23,9 @@ from jaxpg.run.folder import RunFolder
 from jaxpg.run.lines import up_to
 from jaxpg.run.loggers import follower
 from jaxpg.run.loop import Loop, Session, is_solved, updates_made
-from jaxpg.run.program import Program, compile_program, described_jump, make_env, plan
+from jaxpg.run.program import Program, compile_program, make_env
 from jaxpg.run.runtime import prepare
+from jaxpg.run.schedule import described_jump, plan
 from jaxpg.run.signals import StopRequests
 from jaxpg.run.state import RunState
 from jaxpg.run.terminal import Display
