@@ -29,6 +29,7 @@ from jaxpg.online import online_actor_critic
 from jaxpg.run.agents import Agents, agents_of, with_values
 from jaxpg.run.config import Config
 from jaxpg.run.schedule import plan
+from jaxpg.run.sigma import labels, left_alone, log_sigma, with_sigma
 from jaxpg.run.state import Policy, RunState, current_policy, is_key, start
 from jaxpg.run.versions import num_threads
 from jaxpg.soundness import sound
@@ -153,57 +154,7 @@ def make_optimizer(config: Config) -> optax.GradientTransformation:
     optimizers = {"actor": adam(algo.actor_lr), "critic": adam(algo.critic_lr)}
     if config.network.sigma_is != "scheduled":
         return optax.multi_transform(optimizers, {"actor": "actor", "critic": "critic"})
-    return optax.multi_transform(optimizers | {"sigma": left_alone()}, _labels)
-
-
-def left_alone() -> optax.GradientTransformation:
-    """No step, for parameters that something else sets; the state is a number of steps, as it has always been."""
-
-    def init(params):
-        return jnp.zeros((), jnp.int32)
-
-    def update(gradients, count, params=None):
-        return jax.tree.map(jnp.zeros_like, gradients), count + 1
-
-    return optax.GradientTransformation(init, update)
-
-
-def log_sigma(config: Config) -> optax.Schedule:
-    """log sigma after some updates of the run: from the first value to the last in equal steps, and no further."""
-    first, last = np.log(config.network.sigma), np.log(config.network.final_sigma)
-    return optax.linear_schedule(first, last, plan(config).num_updates)
-
-
-def with_sigma(algorithm: Algorithm, log_sigma: optax.Schedule) -> Algorithm:
-    """The algorithm whose policy has log sigma = `log_sigma(n)` after n updates, whatever its gradients and its past.
-
-    The optimizer does not do it: steps that it does not take, and updates that are left out, would hold it up.
-    """
-
-    def settled(state: TrainState) -> TrainState:
-        value = log_sigma(state.update)
-        set_sigma = lambda path, x: jnp.full_like(x, value) if _is_sigma(path) else x  # noqa: E731
-        return state._replace(params=jax.tree_util.tree_map_with_path(set_sigma, state.params))
-
-    def step(state: TrainState, key: jax.Array) -> tuple[TrainState, Metrics]:
-        state, metrics = algorithm.step(settled(state), key)
-        return settled(state), metrics
-
-    return Algorithm(algorithm.init, step)
-
-
-def _is_sigma(path: Any) -> bool:
-    """Whether this is the place of a sigma that does not depend on the state, among the parameters."""
-    return jax.tree_util.keystr(path).endswith("['log_std']")
-
-
-def _labels(params: Any) -> Any:
-    """Which optimizer each parameter has, where sigma has one of its own."""
-
-    def label(path, _):
-        return "sigma" if _is_sigma(path) else path[0].key
-
-    return jax.tree_util.tree_map_with_path(label, params)
+    return optax.multi_transform(optimizers | {"sigma": left_alone()}, labels)
 
 
 def compile_program(
@@ -228,8 +179,36 @@ def compile_program(
       resumed: the state comes from a checkpoint; `init` is not compiled.
       meanwhile: called once while XLA compiles in other threads.
     """
-    run, agents = config.run, agents or agents_of(config)
-    networks = make_networks(config, env)
+    size, agents = config.run.vmap_seeds, agents or agents_of(config)
+    init, advance, play = (over_agents(fn, size) for fn in _of_one_agent(config, env, chunk))
+    of_group = jax.tree.map(lambda x: x[:size], agents)
+    init = jax.jit(init).trace(of_group)
+    shape = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype), init.out_info)
+    with _compilers() as pool:
+        # Tracing holds Python's lock and compiling does not: one trace after the other, that of the longest compilation
+        # first, so that no compilation waits for another one's trace.
+        advance = pool.submit(jax.jit(advance).lower(of_group, shape.train, number=chunk).compile, OPTIMIZED)
+        init = None if resumed else pool.submit(init.lower().compile, RUN_ONCE)
+        play = pool.submit(jax.jit(play).lower(current_policy(shape.train)).compile, OPTIMIZED)
+        meanwhile()
+    at_once = groups_at_once(config)
+    init, advance, play = (in_groups(fn.result(), size, at_once) if fn else None for fn in (init, advance, play))
+
+    def advance_by(train, number=chunk):
+        train, metrics = advance(agents, train, number=number)
+        return train, {name: np.asarray(x)[:, :number] for name, x in metrics.items()}
+
+    return Program(
+        functools.partial(init, agents) if init else None,
+        advance_by,
+        play,
+        jax.tree.map(lambda x: jax.ShapeDtypeStruct((len(agents.seed), *x.shape[1:]), x.dtype), shape),
+    )
+
+
+def _of_one_agent(config: Config, env: Any, chunk: int) -> tuple[Callable, Callable, Callable]:
+    """`init(agent)`, `advance(agent, train, number)` and `play(policy)`, to be traced."""
+    run, networks = config.run, make_networks(config, env)
 
     def algorithm(agent):
         return sound(make_algorithm(with_values(config, agent.values), env), run.nan_policy)
@@ -249,32 +228,7 @@ def compile_program(
         parts = math.gcd(run.eval_episodes, config.num_shards)
         return shards.in_parts(play_from, parts, jax.devices())(policy, starts)
 
-    init, advance, play = (over_agents(fn, run.vmap_seeds) for fn in (init, advance, play))
-    of_group = jax.tree.map(lambda x: x[: run.vmap_seeds], agents)
-    init = jax.jit(init).trace(of_group)
-    shape = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype), init.out_info)
-    with _compilers() as pool:
-        # Tracing holds Python's lock and compiling does not: one trace after the other, that of the longest compilation
-        # first, so that no compilation waits for another one's trace.
-        advance = pool.submit(jax.jit(advance).lower(of_group, shape.train, number=chunk).compile, OPTIMIZED)
-        init = None if resumed else pool.submit(init.lower().compile, RUN_ONCE)
-        play = pool.submit(jax.jit(play).lower(current_policy(shape.train)).compile, OPTIMIZED)
-        meanwhile()
-    at_once = groups_at_once(config)
-    init, advance, play = (
-        in_groups(fn.result(), run.vmap_seeds, at_once) if fn else None for fn in (init, advance, play)
-    )
-
-    def advance_by(train, number=chunk):
-        train, metrics = advance(agents, train, number=number)
-        return train, {name: np.asarray(x)[:, :number] for name, x in metrics.items()}
-
-    return Program(
-        functools.partial(init, agents) if init else None,
-        advance_by,
-        play,
-        jax.tree.map(lambda x: jax.ShapeDtypeStruct((len(agents.seed), *x.shape[1:]), x.dtype), shape),
-    )
+    return init, advance, play
 
 
 @contextlib.contextmanager
