@@ -92,7 +92,7 @@ def resume(given: Mapping[str, Any]) -> int:
     with folder.owned(run_folder, print):
         stored = configuration.load(run_folder.config)
         config = configuration.change(stored, changes)
-        same_run.check_options(run_folder, stored, config, changes)
+        same_run.check_options(run_folder, stored, config)
         return _go_on(stored, config, run_folder)
 
 
@@ -111,7 +111,7 @@ def begin_or_resume(config: Config) -> int:
         stored = configuration.load(run_folder.config)
         # The folder may have been moved, or be given in other words.
         config = dataclasses.replace(config, run=dataclasses.replace(config.run, run_dir=stored.run.run_dir))
-        same_run.check_options(run_folder, stored, config, configuration.named(stored) | configuration.named(config))
+        same_run.check_options(run_folder, stored, config)
         return _go_on(stored, config, run_folder)
 
 
