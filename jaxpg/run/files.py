@@ -80,7 +80,7 @@ def opened(folder: Path, make: bool = False) -> Iterator[int]:
     """A descriptor of a folder, inside.
 
     Args:
-      folder: any; links that lead to it are followed as far as a run folder, and not inside.
+      folder: any; links that lead to it are followed, but not one that stands for it in a run folder.
       make: where there is none; not those above it.
 
     Raises:

@@ -103,30 +103,34 @@ def summary(found: Inspection) -> dict[str, Any]:
 
 def described(found: Inspection) -> str:
     """The inspection in words, a line for each thing."""
-    config, schedule = found.config, found.schedule
-    done, total = found.update * schedule.steps_per_update, schedule.total_steps
+    done, total = found.update * found.schedule.steps_per_update, found.schedule.total_steps
+    checkpoints = [f"{number} {problem.word if problem else 'sound'}" for number, problem in found.checkpoints.items()]
     rows = {
-        "run": agents.described(config),
+        "run": agents.described(found.config),
         "progress": f"{done:,} of {total:,} steps, " + ("finished" if found.finished else "not finished"),
-        "checkpoints": ", ".join(
-            f"{number} {'sound' if problem is None else problem.word}" for number, problem in found.checkpoints.items()
-        )
-        or "none",
+        "checkpoints": ", ".join(checkpoints) or "none",
     }
     if found.owner:
         rows["training"] = f"just now, by {found.owner}"
-    evaluations = [line["eval_return"] for line in found.lines if "eval_return" in line]
-    if evaluations:
-        best = jsonable(best_returns(found.lines))
-        rows["return"] = f"{shown(evaluations[-1])} at the last evaluation, {shown(best)} at best"
-        if config.sweep:
-            setting, score = next(iter(table(config, found.lines).items()))
-            rows["best setting"] = f"{setting}: {score}"
-    rows["versions"] = "as they are now"
-    if found.changed:
-        rows["versions"] = ", ".join(f"{name} was {was} and is {now}" for name, (was, now) in found.changed.items())
-    if found.earlier:
-        rows["versions"] += f"; {found.earlier} others before (versions.json)"
-    rows["digest"] = found.digest or "none"
+    rows |= _returns(found) | {"versions": _versions(found), "digest": found.digest or "none"}
     problems = [f"{problem.word}: {problem}" for problem in found.checkpoints.values() if problem]
     return "\n".join([f"{name:<12} {value}" for name, value in rows.items()] + problems)
+
+
+def _returns(found: Inspection) -> dict[str, str]:
+    """What the evaluations say; nothing before the first."""
+    evaluations = [line["eval_return"] for line in found.lines if "eval_return" in line]
+    if not evaluations:
+        return {}
+    best = jsonable(best_returns(found.lines))
+    rows = {"return": f"{shown(evaluations[-1])} at the last evaluation, {shown(best)} at best"}
+    if found.config.sweep:
+        setting, score = next(iter(table(found.config, found.lines).items()))
+        rows["best setting"] = f"{setting}: {score}"
+    return rows
+
+
+def _versions(found: Inspection) -> str:
+    changes = ", ".join(f"{name} was {was} and is {now}" for name, (was, now) in found.changed.items())
+    earlier = f"; {found.earlier} others before (versions.json)" if found.earlier else ""
+    return (changes or "as they are now") + earlier
