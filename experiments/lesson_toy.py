@@ -32,7 +32,8 @@ from jaxpg.networks import linear_mean
 from jaxpg.rollout import rollout
 from jaxpg.run.config import compose
 from jaxpg.run.errors import run_command
-from jaxpg.run.program import make_algorithm, make_env, plan
+from jaxpg.run.program import make_algorithm, make_env
+from jaxpg.run.schedule import plan
 from jaxpg.training import initial_state, train_scan
 from jaxpg.vector_env import vectorize
 

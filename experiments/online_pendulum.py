@@ -27,7 +27,8 @@ from jaxpg.run.agents import agents_of
 from jaxpg.run.config import compose
 from jaxpg.run.errors import run_command
 from jaxpg.run.figures import draw_curve
-from jaxpg.run.program import make_algorithm, make_env, plan
+from jaxpg.run.program import make_algorithm, make_env
+from jaxpg.run.schedule import plan
 from jaxpg.run.statistics import interquartile_mean
 from jaxpg.training import train_scan
 

@@ -10,6 +10,7 @@ and writes results/startup.json. Wall-clock needs a machine that does nothing el
 from __future__ import annotations
 
 import json
+import operator
 import os
 import subprocess
 import sys
@@ -26,14 +27,14 @@ from jaxpg.run.errors import run_command
 
 ARGUMENTS = ("env=pendulum",)
 MEASURED = "--measured"  # a process of this script that is the command, and notes where its time goes
-# Phases by what is called in them: of `jaxpg.run.session`, of its `Keeper`, or of the configuration.
+# Phases by what is called in them, of `jaxpg.run`.
 PHASES = {
-    "options": ("configuration.compose",),
-    "environment": ("_env",),
-    "tracing and compiling": ("_compile",),
-    "evaluations": ("_evaluate",),
-    "checkpoints": ("Keeper.__init__", "Keeper.save"),
-    "figure": ("_draw",),
+    "options": ("config.compose",),
+    "environment": ("session._env",),
+    "tracing and compiling": ("session._compile",),
+    "evaluations": ("loop._evaluate",),
+    "checkpoints": ("keeper.Keeper.__init__", "keeper.Keeper.save"),
+    "figure": ("closing.draw_learning_curve",),
 }
 TRACING = ("jaxpr_trace_duration", "jaxpr_to_mlir_module_duration")
 PROGRAMS = {name for program in ("init", "advance", "play") for name in (program, f"jit({program})")}
@@ -125,7 +126,8 @@ class Stopwatch:
 def measured(report: str, began: float, arguments: list[str]) -> int:
     """The training command with its phases timed."""
     watch = Stopwatch(began)
-    from jaxpg.run import session
+    from jaxpg import run
+    from jaxpg.run import session  # and with it all that PHASES names
     from jaxpg.run.metrics_log import MetricsLog
     from jaxpg.train import main as train
 
@@ -134,7 +136,7 @@ def measured(report: str, began: float, arguments: list[str]) -> int:
     for phase, names in PHASES.items():
         for name in names:
             owner, _, leaf = name.rpartition(".")
-            watch.watch(getattr(session, owner) if owner else session, leaf, phase)
+            watch.watch(operator.attrgetter(owner)(run), leaf, phase)
     written = MetricsLog.write
 
     def first(log, line):

@@ -23,8 +23,9 @@ from jaxpg.run.agents import crossed
 from jaxpg.run.config import Config, compose
 from jaxpg.run.errors import run_command
 from jaxpg.run.names import own_metrics
-from jaxpg.run.program import compile_program, make_env, plan
+from jaxpg.run.program import compile_program, make_env
 from jaxpg.run.runtime import prepare
+from jaxpg.run.schedule import plan
 from jaxpg.run.state import current_policy
 from jaxpg.run.sweep import Setting
 

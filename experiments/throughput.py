@@ -34,8 +34,9 @@ from commands import Parser, write_json
 from jaxpg.rollout import rollout
 from jaxpg.run.config import Config, compose
 from jaxpg.run.errors import run_command
-from jaxpg.run.program import compile_program, make_algorithm, make_env, plan
+from jaxpg.run.program import compile_program, make_algorithm, make_env
 from jaxpg.run.runtime import prepare
+from jaxpg.run.schedule import plan
 from jaxpg.training import initial_state, train_scan
 from jaxpg.vector_env import vectorize
 

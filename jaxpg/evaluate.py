@@ -52,9 +52,14 @@ def _rows(results: Results) -> dict[str, str]:
     elif exploded:
         rows["diverged"] = f"{exploded} of {number} episodes, each counted as the worst of the others, and as 0 at best"
     for name, values in results.metrics.items():
-        value = finite_mean(values)
-        rows[name] = f"{value:.2%}" if name == "success" else f"{value:.4g} on average at the end"
+        rows[name] = _in_words(name, float(finite_mean(values)))
     return rows
+
+
+def _in_words(name: str, value: float) -> str:
+    if not math.isfinite(value):
+        return "n/a"
+    return f"{value:.2%}" if name == "success" else f"{value:.4g} on average at the end"
 
 
 def _summary(results: Results) -> dict[str, Any]:

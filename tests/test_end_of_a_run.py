@@ -2,6 +2,7 @@
 
 import itertools
 import json
+import shutil
 from signal import SIGTERM
 
 import jax
@@ -14,7 +15,8 @@ from jaxpg import train
 from jaxpg.run import program, session
 from jaxpg.run.chunks import PATIENCE, Watch
 from jaxpg.run.config import compose
-from jaxpg.run.program import compile_program, described_jump, make_algorithm, make_env, plan
+from jaxpg.run.program import compile_program, make_algorithm, make_env
+from jaxpg.run.schedule import described_jump, plan
 from jaxpg.training import initial_state, train_chunk, train_scan
 from jaxpg.types import Algorithm, TrainState
 
@@ -132,6 +134,23 @@ def test_a_run_that_was_stopped_ends_where_one_ends_that_was_not(tmp_path, monke
     assert train.main([*SIZES, f"log_interval={7 * STEPS}", f"run_dir={tmp_path / 'other'}"]) == 0
     assert updates_of(tmp_path / "other") == [7, 14, 20]
     assert outcome(tmp_path / "other")[1:] == outcome(tmp_path / "whole")[1:]
+
+
+def test_a_return_that_was_reached_after_the_last_checkpoint_is_reached_again(tmp_path, capsys):
+    """As after a kill between the line that has it and the checkpoint: the best policy is on no disk yet."""
+    run, undisturbed = tmp_path / "run", tmp_path / "undisturbed"
+    arguments = [size for size in SIZES if not size.startswith("eval_interval")]
+    arguments += [CHUNKS_OF_THREE, "eval_interval=1", f"checkpoint_interval={3 * STEPS}"]
+    assert train.main([*arguments, f"run_dir={undisturbed}"]) == 0
+    returns = [json.loads(line)["eval_return"] for line in (undisturbed / "metrics.jsonl").read_text().splitlines()]
+    stop = f"stop_return={max(returns)}"
+    assert train.main([*arguments, stop, f"run_dir={run}"]) == 0
+    reached = outcome(run)
+    shutil.rmtree(run / "checkpoints" / str(reached[1]))
+    capsys.readouterr()
+    assert train.main([f"resume={run}"]) == 0
+    assert "has reached" not in capsys.readouterr().out
+    assert outcome(run) == reached
 
 
 # --- schedules --------------------------------------------------------------------------------------------------------

@@ -14,7 +14,10 @@ from exploding import Blind, ExplodingConfig, Falls, Servo
 from hypothesis import given
 from hypothesis import strategies as st
 
+from jaxpg import evaluate as command
 from jaxpg.evaluation import evaluate, play
+from jaxpg.run import closing
+from jaxpg.run.episodes import Results
 from jaxpg.run.state import Best, better
 from jaxpg.run.statistics import counted_returns
 
@@ -167,6 +170,22 @@ def test_an_observation_out_of_bounds_ends_in_one_line(program, tmp_path):
     assert "in units in which it is smaller" in said
     assert "Traceback" not in said
     assert not (tmp_path / "run" / "metrics.jsonl").exists()
+
+
+def test_what_is_no_number_is_said_in_words():
+    nothing, mixed = np.full(2, np.nan), np.array([np.nan, 0.5])
+    metrics = {"success": nothing, "distance": nothing, "height": mixed}
+    rows = command._rows(Results(np.array([1.0, 2.0]), np.zeros(2, bool), metrics))
+    assert (rows["success"], rows["distance"]) == ("n/a", "n/a")
+    assert rows["height"].startswith("0.5 ")
+
+
+def test_of_several_agents_it_is_said_how_many_have_the_untrained_policy():
+    lines = [{"eval_return": [None, 1.0, 2.0], "eval_diverged": [8, 0, 1]}]
+    rows = closing._evaluated(lines)
+    assert rows["best policy"].startswith("the untrained one of 1 of the 3 agents: ")
+    assert rows["diverged"] == "9 episodes of the last evaluation"
+    assert "best policy" not in closing._evaluated([{"eval_return": [1.0, 2.0]}])
 
 
 def test_a_run_all_of_whose_episodes_diverge_calls_no_policy_best(program, tmp_path):

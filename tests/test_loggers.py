@@ -79,7 +79,9 @@ def _this_process_is_not_a_sender():
 @pytest.fixture
 def run_folder(tmp_path):
     (tmp_path / "run").mkdir()
-    (tmp_path / "run" / "config.yaml").write_text("seed: 3\nenv:\n  id: pendulum\n  mass: 1.0\n")
+    (tmp_path / "run" / "config.yaml").write_text(
+        "program: /home/me/robot.py\nseed: 3\nenv:\n  id: pendulum\n  mass: 1e-3\n"
+    )
     return RunFolder(tmp_path / "run")
 
 
@@ -196,7 +198,7 @@ def test_lines_are_sent_when_they_are_whole(tmp_path, size):
 def test_a_service_gets_the_configuration_the_name_and_every_line(run_folder, stand_in, capfd):
     log_lines(run_folder, [1, 2, 3])
     (init, _, name, config), *logged = stand_in()
-    assert (init, name, config) == ("init", "run", {"seed": 3, "env": {"id": "pendulum", "mass": 1.0}})
+    assert (init, name, config) == ("init", "run", {"seed": 3, "env": {"id": "pendulum", "mass": 1e-3}})
     written = [(line["steps"], values_of(line)) for line in folder.read_metrics(run_folder)]
     assert [(step, values) for _, step, values in logged] == written
     assert len(written) == 3

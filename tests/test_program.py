@@ -9,7 +9,8 @@ import pytest
 import envs
 from jaxpg.learning import Reuse
 from jaxpg.run.config import compose, flatten
-from jaxpg.run.program import compile_program, make_algorithm, make_env, make_reuse, plan
+from jaxpg.run.program import compile_program, make_algorithm, make_env, make_reuse
+from jaxpg.run.schedule import plan
 from jaxpg.run.state import current_policy
 from jaxpg.training import train_scan
 

@@ -26,7 +26,8 @@ from envs.quadratic import (
 from jaxpg.networks import linear_mean
 from jaxpg.rollout import rollout
 from jaxpg.run.config import compose
-from jaxpg.run.program import make_algorithm, make_env, plan
+from jaxpg.run.program import make_algorithm, make_env
+from jaxpg.run.schedule import plan
 from jaxpg.training import train_scan
 from jaxpg.vector_env import vectorize
 

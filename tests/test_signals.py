@@ -104,6 +104,18 @@ def test_a_second_interrupt_ends_a_training_at_once():
     assert heard == [signal.SIGINT]
 
 
+def test_an_interrupt_that_is_to_be_ignored_stays_ignored_after_another_signal():
+    """As in the background of a shell, when a scheduler ends the job."""
+    before = signal.signal(signal.SIGINT, signal.SIG_IGN)
+    try:
+        with StopRequests() as stop:
+            os.kill(os.getpid(), signal.SIGTERM)
+            assert stop.signal == signal.SIGTERM
+            assert signal.getsignal(signal.SIGINT) is signal.SIG_IGN
+    finally:
+        signal.signal(signal.SIGINT, before)
+
+
 COMPILING = """
 import jax, threading, time
 from concurrent.futures import ThreadPoolExecutor

@@ -13,6 +13,7 @@ from envs.options import OptionError, option
 from jaxpg.actor_critic import BASELINES
 from jaxpg.estimators import normalize_advantages
 from jaxpg.run.config import compose
+from jaxpg.run.conflicts import OF_OTHER_EPISODES
 from jaxpg.run.program import make_algorithm, make_env
 from jaxpg.training import train_scan
 
@@ -105,6 +106,4 @@ def test_equal_advantages_become_nothing_and_no_noise(size, value):
 
 
 def test_baselines_that_need_others_are_all_known():
-    from jaxpg.run.config import OF_OTHER_EPISODES
-
     assert {*OF_OTHER_EPISODES, "none", "value"} == {*BASELINES}

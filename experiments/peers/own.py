@@ -19,8 +19,9 @@ sys.path.insert(0, str(Path(__file__).parents[2]))  # the repository, if it is n
 from jaxpg.actor_critic import deterministic_policy  # noqa: E402
 from jaxpg.run.cache import compilation_cache, physics_cache  # noqa: E402
 from jaxpg.run.config import compose  # noqa: E402
-from jaxpg.run.program import compile_program, make_env, make_networks, plan  # noqa: E402
+from jaxpg.run.program import compile_program, make_env, make_networks  # noqa: E402
 from jaxpg.run.runtime import prepare  # noqa: E402
+from jaxpg.run.schedule import plan  # noqa: E402
 from jaxpg.run.state import current_policy  # noqa: E402
 
 

@@ -10,8 +10,6 @@ from __future__ import annotations
 import contextlib
 import errno
 import functools
-import hashlib
-import json
 import logging
 import os
 import re
@@ -29,7 +27,7 @@ from orbax import checkpoint as ocp
 
 from jaxpg.run import files
 from jaxpg.run.errors import UserError
-from jaxpg.run.state import is_key
+from jaxpg.run.leaves import described, digest, from_storage, kinds_of, name_of, on_host, stored_as
 from jaxpg.types import PyTree
 
 
@@ -127,10 +125,10 @@ class Checkpoints:
         Raises:
           SaveError: it cannot be written; nothing is left of it. RuntimeError: orbax declines.
         """
-        leaves = _host_leaves(tree)
+        leaves = on_host(tree)
         content = {name: leaf for name, leaf in leaves.items() if leaf.size}  # orbax refuses empty arrays
-        record = {"step": step, "meta": dict(meta), "leaves": {name: _describe(leaf) for name, leaf in leaves.items()}}
-        record["sha256"] = _digest(record)
+        record = {"step": step, "meta": dict(meta), "leaves": {name: described(leaf) for name, leaf in leaves.items()}}
+        record["sha256"] = digest(record)
         arguments = ocp.args.Composite(state=ocp.args.StandardSave(content), meta=ocp.args.JsonSave(record))
         with self._writing(step):
             saved = self._manager.save(step, args=arguments)
@@ -197,12 +195,12 @@ class Checkpoints:
         """
         record = self._read(step, meta=ocp.args.JsonRestore())["meta"]
         try:
-            _kinds(record["leaves"])
+            kinds_of(record["leaves"])
             found = {name: record[name] for name in ("step", "meta", "leaves")}
         except (TypeError, ValueError, KeyError, AttributeError) as error:  # JSON all the same, after a flipped bit
             problem = f"{self.folder / str(step)}: damaged, its record is not one of ours ({_reason(error)})"
             raise CheckpointError(problem) from error
-        if record.get("sha256", _digest(found)) != _digest(found):  # earlier versions have written none
+        if record.get("sha256", digest(found)) != digest(found):  # earlier versions have written none
             raise CheckpointError(f"{self.folder / str(step)}: damaged, its record differs from what was saved")
         return found
 
@@ -216,14 +214,14 @@ class Checkpoints:
         if record["step"] != step:
             raise CheckpointError(f"{self.folder / str(step)}: damaged, it is what was saved as {record['step']}")
         recorded = record["leaves"]
-        kinds = _kinds(recorded)
+        kinds = kinds_of(recorded)
         stored = {name: kind for name, kind in kinds.items() if kind.size}
         restored = self._read(step, state=ocp.args.StandardRestore(stored))["state"]
         leaves = {
             name: np.asarray(restored.get(name, np.zeros(kind.shape, kind.dtype))) for name, kind in kinds.items()
         }
         for name, leaf in leaves.items():
-            if _describe(leaf) != recorded[name]:
+            if described(leaf) != recorded[name]:
                 raise CheckpointError(f"{self.folder / str(step)}: damaged, {name} differs from what was saved")
         return leaves
 
@@ -238,10 +236,10 @@ class Checkpoints:
           CheckpointError: it cannot be read, was made by another program, or its content is damaged.
         """
         paths, structure = jax.tree_util.tree_flatten_with_path(template)
-        expected = {_name(path): leaf for path, leaf in paths}
+        expected = {name_of(path): leaf for path, leaf in paths}
         self._check_same_program(step, self.record(step)["leaves"], expected)
         arrays = self.read(step)
-        leaves = [_from_storage(arrays[name], leaf) for name, leaf in expected.items()]
+        leaves = [from_storage(arrays[name], leaf) for name, leaf in expected.items()]
         return jax.tree_util.tree_unflatten(structure, leaves)
 
     def digest(self, step: int) -> str:
@@ -250,7 +248,7 @@ class Checkpoints:
         Raises:
           CheckpointError: the record cannot be read.
         """
-        return _digest(self.record(step)["leaves"])
+        return digest(self.record(step)["leaves"])
 
     def _check_same_program(self, step: int, recorded: Mapping[str, Any], expected: Mapping[str, Any]) -> None:
         names = sorted(recorded.keys() ^ expected.keys())
@@ -259,7 +257,7 @@ class Checkpoints:
                 f"{self.folder / str(step)}: made by another program: {names[0]} is in only one of them"
             )
         for name, leaf in expected.items():
-            ours, saved = _storage(leaf), recorded[name]
+            ours, saved = stored_as(leaf), recorded[name]
             if [list(ours.shape), str(ours.dtype)] != saved[:2]:
                 raise CheckpointError(
                     f"{self.folder / str(step)}: made by another program: {name} is {saved[1]}{saved[0]} there, "
@@ -323,46 +321,3 @@ def _silence_what_is_left_behind() -> None:
     )
     for name, words in silenced:
         logging.getLogger(name).addFilter(lambda record, words=words: words not in record.getMessage())
-
-
-def _kinds(recorded: Mapping[str, Any]) -> dict[str, jax.ShapeDtypeStruct]:
-    """Shape and type of each recorded leaf."""
-    return {name: jax.ShapeDtypeStruct(shape, dtype) for name, (shape, dtype, _) in recorded.items()}
-
-
-def _host_leaves(tree: PyTree) -> dict[str, np.ndarray]:
-    paths, _ = jax.tree_util.tree_flatten_with_path(tree)
-    return {_name(path): np.asarray(_to_storage(leaf)) for path, leaf in paths}
-
-
-def _name(path: tuple) -> str:
-    return jax.tree_util.keystr(path, simple=True, separator="/")
-
-
-def _to_storage(leaf: Any) -> Any:
-    return jax.random.key_data(leaf) if is_key(leaf) else leaf
-
-
-def _storage(leaf: Any) -> jax.ShapeDtypeStruct:
-    return jax.eval_shape(_to_storage, leaf)
-
-
-def _from_storage(array: Any, leaf: Any) -> jax.Array:
-    array = jax.device_put(array)  # jax.numpy.asarray would compile a program for it
-    return jax.random.wrap_key_data(array, impl=_key_impl(leaf)) if is_key(leaf) else array
-
-
-def _key_impl(leaf: Any) -> str:
-    """Whose random keys these are; of shapes and types, which `jax.random.key_impl` does not take, as well."""
-    names = ("threefry2x32", "rbg", "unsafe_rbg")
-    return next(
-        name for name in names if jax.eval_shape(functools.partial(jax.random.key, 0, impl=name)).dtype == leaf.dtype
-    )
-
-
-def _digest(record: Mapping[str, Any]) -> str:
-    return hashlib.sha256(json.dumps(record, sort_keys=True).encode()).hexdigest()
-
-
-def _describe(leaf: np.ndarray) -> list[Any]:
-    return [list(leaf.shape), str(leaf.dtype), hashlib.sha256(np.ascontiguousarray(leaf).tobytes()).hexdigest()]

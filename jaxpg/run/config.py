@@ -10,23 +10,22 @@ what a user writes stands as it is written, `${...}` too.
 from __future__ import annotations
 
 import dataclasses
-import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 import envs
 from envs.options import OptionError, build, unknown
-from jaxpg.run import files, plain_yaml, registered
+from jaxpg.run import conflicts, files, plain_yaml, registered
 from jaxpg.run import sweep as sweeping
+from jaxpg.run.conflicts import nearest_divisor
 from jaxpg.run.errors import UserError
 from jaxpg.run.schema import GROUPS, LARGEST, Gaussian, Run, option_fields
 
 DEFAULT_CHOICES = {"env": "pendulum", "algo": "td", "network": "mlp"}  # algo: the first that the environment has tuned
 FOLDERS = ("run_dir", "resume", "run", "out")  # options whose value is a path
 DEFAULT_ROLLOUT = 16  # steps of a TD rollout where neither the user nor the environment says
-OF_OTHER_EPISODES = ("mean", "time_mean", "optimal", "leave_one_out")  # baselines that are means over episodes
 LIBRARIES = ("brax", "playground")  # whose environments have names of their own, as the option `name`
 
 
@@ -101,101 +100,14 @@ def from_dict(values: Mapping[str, Any], problems: Sequence[str] = ()) -> Config
 
 
 def _complete(config: Config) -> Config:
-    """The rollout length filled in, which depends on algorithm and environment."""
-    problems = [*_conflicts_of_the_algorithm(config), *_conflicts_of_the_network(config), *_conflicts_of_agents(config)]
+    """The rollout length filled in, which depends on algorithm and environment; and what then does not go together."""
+    problems = list(conflicts.of_choices(config))
     default = config.env.episode_length if config.choices["algo"] == "reinforce" else DEFAULT_ROLLOUT
     config = dataclasses.replace(config, run=dataclasses.replace(config.run, num_steps=config.run.num_steps or default))
-    problems += [
-        *_conflicts_of_sizes(config.run, config.algo, config.env.episode_length),
-        *_batches_that_cannot_teach(config),
-    ]
+    problems += conflicts.of_sizes(config)
     if problems:
         raise OptionError(problems)
     return config
-
-
-def _conflicts_of_the_algorithm(config: Config) -> Iterator[str]:
-    algo, run, horizon = config.algo, config.run, config.env.episode_length
-    if config.choices["algo"] == "reinforce":
-        if run.num_steps not in (None, horizon):
-            yield f"num_steps={run.num_steps}: algo=reinforce plays whole episodes, {horizon} steps here; leave it out"
-        if algo.discounted and algo.returns == "whole":
-            yield "algo.discounted=true: whole returns have the factors gamma^t in them; leave it out"
-    shards = config.num_shards
-    if run.num_envs % shards:
-        yield _does_not_divide("algo.num_shards", shards, f"num_envs={run.num_envs}", run.num_envs)
-    elif config.choices["algo"] == "ppo" and run.num_envs // shards % algo.minibatches:
-        whole = f"num_envs={run.num_envs}" + (f" / algo.num_shards={shards}" if shards > 1 else "")
-        yield _does_not_divide("algo.minibatches", algo.minibatches, whole, run.num_envs // shards)
-
-
-def _batches_that_cannot_teach(config: Config) -> Iterator[str]:
-    """Batches of which nothing is left once their own mean is taken away: the policy would stay what it is for ever."""
-    algo, run = config.algo, config.run
-    if config.choices["algo"] == "reinforce" and run.num_envs < 2:
-        if algo.baseline in OF_OTHER_EPISODES:
-            yield (
-                f"algo.baseline={algo.baseline} needs other episodes, with a single one it is that one's own return: "
-                "num_envs must be at least 2; algo.baseline=none and value do without"
-            )
-        if algo.returns == "whole" and algo.normalize_advantages:
-            yield (
-                "algo.returns=whole algo.normalize_advantages=true: the mean that is taken away is the return of the "
-                "only episode; num_envs must be at least 2, or algo.normalize_advantages=false"
-            )
-    if run.num_envs * run.num_steps == 1 and getattr(algo, "normalize_advantages", False):
-        yield (
-            f"num_envs={run.num_envs} num_steps={run.num_steps}: less its mean a single advantage is 0; "
-            "take more of either, or algo.normalize_advantages=false"
-        )
-
-
-def _does_not_divide(name: str, value: int, whole: str, number: int) -> str:
-    return f"{name}={value} does not divide {whole}: the nearest that does is {_nearest_divisor(number, value)}"
-
-
-def _conflicts_of_the_network(config: Config) -> Iterator[str]:
-    network = config.network
-    if network.sigma_is == "scheduled":
-        if config.choices["algo"] == "online":
-            yield "network.sigma_is=scheduled: algo=online has no schedules; fixed, learned and state are left"
-        if "network.sigma" in config.sweep:
-            yield "sweep.network.sigma: cannot be swept with network.sigma_is=scheduled; each value needs its own run"
-    if network.features == "radial" and network.order < 2:
-        yield f"network.order={network.order}: radial features need at least 2 points of an axis"
-
-
-def _conflicts_of_agents(config: Config) -> Iterator[str]:
-    run = config.run
-    if config.num_agents % run.vmap_seeds:
-        yield (
-            f"vmap_seeds={run.vmap_seeds} does not divide the number of agents, {config.num_agents}: "
-            f"the nearest that does is {_nearest_divisor(config.num_agents, run.vmap_seeds)}"
-        )
-    if run.num_seeds + run.seed > 2**32:
-        yield f"seed={run.seed} num_seeds={run.num_seeds}: seeds must stay below 2**32"
-
-
-def _conflicts_of_sizes(run: Run, algo: Any, horizon: int) -> Iterator[str]:
-    """XLA's indices and the counters of steps and updates are 32-bit numbers."""
-    if horizon < 1:
-        yield f"env.episode_length={horizon}: it must be at least 1"
-    if horizon >= 2**31:
-        yield f"env.episode_length={horizon}: it must stay below 2**31"
-    rollout = run.num_envs * run.num_steps
-    if rollout >= 2**31:
-        yield f"num_envs={run.num_envs} num_steps={run.num_steps}: their product must stay below 2**31"
-        return
-    of_update = getattr(algo, "epochs", 1) * getattr(algo, "minibatches", 1)
-    most = rollout * ((2**31 - 1) // of_update)
-    if run.total_steps >= most:
-        gradients = f" and {of_update} gradient steps" if of_update > 1 else ""
-        yield f"total_steps={run.total_steps}: with {rollout} steps{gradients} an update it must stay below {most}"
-
-
-def _nearest_divisor(number: int, to: int) -> int:
-    small = [n for n in range(1, math.isqrt(number) + 1) if number % n == 0]
-    return min(sorted({*small, *(number // n for n in small)}), key=lambda n: abs(n - to))
 
 
 def compose(arguments: Sequence[str]) -> Config:
@@ -260,7 +172,7 @@ def _fitting(tuned: Mapping[str, Any], given: Mapping[str, Any]) -> Mapping[str,
             left //= given[name]  # where it does not divide them, that is a conflict of what was asked for
     for name in divisors:
         if name in tuned and name not in given:
-            fitting[name] = _nearest_divisor(left, tuned[name])
+            fitting[name] = nearest_divisor(left, tuned[name])
             left //= fitting[name]
     return {**tuned, **fitting}
 

@@ -80,7 +80,7 @@ def opened(folder: Path, make: bool = False) -> Iterator[int]:
     """A descriptor of a folder, inside.
 
     Args:
-      folder: any; links that lead to it are followed as far as a run folder, and not inside.
+      folder: any; links that lead to it are followed, but not one that stands for it in a run folder.
       make: where there is none; not those above it.
 
     Raises:
@@ -95,7 +95,7 @@ def opened(folder: Path, make: bool = False) -> Iterator[int]:
 
 def open_folder(folder: Path, make: bool = False) -> int:
     """As `opened`; to be closed."""
-    for root, owner in _owned.items():
+    for root, owner in tuple(_owned.items()):  # other threads may begin and end runs meanwhile
         if Path(os.path.abspath(folder)).is_relative_to(root):
             return _open_own(os.path.relpath(folder, root), owner, make)
     if all(os.path.lexists(folder.parent / name) for name in ("config.yaml", "best")):

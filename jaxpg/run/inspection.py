@@ -9,10 +9,11 @@ from jaxpg.run import config as configuration
 from jaxpg.run.checkpoint import CheckpointError, Checkpoints
 from jaxpg.run.config import Config
 from jaxpg.run.folder import RunFolder, jsonable
-from jaxpg.run.program import Schedule, plan
+from jaxpg.run.lines import up_to
+from jaxpg.run.loop import is_solved
 from jaxpg.run.results import best_returns, table
 from jaxpg.run.runtime import prepare
-from jaxpg.run.session import is_solved
+from jaxpg.run.schedule import Schedule, plan
 from jaxpg.run.terminal import shown
 
 
@@ -62,6 +63,7 @@ def inspect(path: str) -> Inspection:
     sound = [number for number, problem in checkpoints.items() if problem is None]
     update = sound[0] if sound else 0
     schedule = plan(config)
+    best_of_checkpoint = best_returns(up_to(lines, update))
     before = folder.read_versions(run_folder)
     return Inspection(
         run_folder=run_folder,
@@ -69,7 +71,7 @@ def inspect(path: str) -> Inspection:
         checkpoints=checkpoints,
         update=update,
         schedule=schedule,
-        finished=bool(sound) and (update >= schedule.num_updates or is_solved(config.run, best_returns(lines))),
+        finished=bool(sound) and (update >= schedule.num_updates or is_solved(config.run, best_of_checkpoint)),
         owner=lock.owner(run_folder.path),
         digest=stored.digest(update) if sound else None,
         lines=lines,
@@ -101,30 +103,34 @@ def summary(found: Inspection) -> dict[str, Any]:
 
 def described(found: Inspection) -> str:
     """The inspection in words, a line for each thing."""
-    config, schedule = found.config, found.schedule
-    done, total = found.update * schedule.steps_per_update, schedule.total_steps
+    done, total = found.update * found.schedule.steps_per_update, found.schedule.total_steps
+    checkpoints = [f"{number} {problem.word if problem else 'sound'}" for number, problem in found.checkpoints.items()]
     rows = {
-        "run": agents.described(config),
+        "run": agents.described(found.config),
         "progress": f"{done:,} of {total:,} steps, " + ("finished" if found.finished else "not finished"),
-        "checkpoints": ", ".join(
-            f"{number} {'sound' if problem is None else problem.word}" for number, problem in found.checkpoints.items()
-        )
-        or "none",
+        "checkpoints": ", ".join(checkpoints) or "none",
     }
     if found.owner:
         rows["training"] = f"just now, by {found.owner}"
-    evaluations = [line["eval_return"] for line in found.lines if "eval_return" in line]
-    if evaluations:
-        best = jsonable(best_returns(found.lines))
-        rows["return"] = f"{shown(evaluations[-1])} at the last evaluation, {shown(best)} at best"
-        if config.sweep:
-            setting, score = next(iter(table(config, found.lines).items()))
-            rows["best setting"] = f"{setting}: {score}"
-    rows["versions"] = "as they are now"
-    if found.changed:
-        rows["versions"] = ", ".join(f"{name} was {was} and is {now}" for name, (was, now) in found.changed.items())
-    if found.earlier:
-        rows["versions"] += f"; {found.earlier} others before (versions.json)"
-    rows["digest"] = found.digest or "none"
+    rows |= _returns(found) | {"versions": _versions(found), "digest": found.digest or "none"}
     problems = [f"{problem.word}: {problem}" for problem in found.checkpoints.values() if problem]
     return "\n".join([f"{name:<12} {value}" for name, value in rows.items()] + problems)
+
+
+def _returns(found: Inspection) -> dict[str, str]:
+    """What the evaluations say; nothing before the first."""
+    evaluations = [line["eval_return"] for line in found.lines if "eval_return" in line]
+    if not evaluations:
+        return {}
+    best = jsonable(best_returns(found.lines))
+    rows = {"return": f"{shown(evaluations[-1])} at the last evaluation, {shown(best)} at best"}
+    if found.config.sweep:
+        setting, score = next(iter(table(found.config, found.lines).items()))
+        rows["best setting"] = f"{setting}: {score}"
+    return rows
+
+
+def _versions(found: Inspection) -> str:
+    changes = ", ".join(f"{name} was {was} and is {now}" for name, (was, now) in found.changed.items())
+    earlier = f"; {found.earlier} others before (versions.json)" if found.earlier else ""
+    return (changes or "as they are now") + earlier

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import math
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from typing import Any
 
 LARGEST = 2**63  # below it are all counts
@@ -39,6 +39,11 @@ def sound(text: str, agents: int | None = None) -> tuple[list[dict[str, Any]], l
         else:
             damaged.append(number)
     return found, damaged
+
+
+def up_to(lines: Iterable[dict[str, Any]], update: int) -> list[dict[str, Any]]:
+    """The lines of the first updates: those that a checkpoint after `update` of them goes on from."""
+    return [line for line in lines if line["update"] <= update]
 
 
 def _parsed(text: str) -> dict[str, Any] | None:

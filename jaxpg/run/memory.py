@@ -18,7 +18,8 @@ import jax
 from jaxpg.features import num_features
 from jaxpg.run.config import Config, flatten
 from jaxpg.run.errors import UserError
-from jaxpg.run.program import groups_at_once, plan
+from jaxpg.run.program import groups_at_once
+from jaxpg.run.schedule import plan
 from jaxpg.types import PyTree
 
 NUMBER = 4  # bytes

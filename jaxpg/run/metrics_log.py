@@ -10,7 +10,7 @@ from typing import Any
 
 from jaxpg.run import files
 from jaxpg.run.folder import RunFolder, metrics_text, replace
-from jaxpg.run.lines import json_line, sound
+from jaxpg.run.lines import json_line, sound, up_to
 from jaxpg.run.loggers import UntilItFails, values_of
 from jaxpg.run.loggers.follower import Follower
 from jaxpg.run.loggers.tensorboard import TensorBoard
@@ -56,7 +56,7 @@ class MetricsLog:
         lines, damaged = sound(metrics_text(self._folder), agents)
         for number in damaged:
             self._say(f"note: {self._folder.metrics}: line {number} is damaged and left out; the others are kept")
-        kept = [line for line in lines if line["update"] <= update]
+        kept = up_to(lines, update)
         text = "".join(map(json_line, kept))
         replace(self._folder.metrics, text)
         self._size = len(text)  # of the whole lines in the file; in ASCII a character is a byte

@@ -28,6 +28,8 @@ from jaxpg.networks import Networks, linear_networks, mlp_networks
 from jaxpg.online import online_actor_critic
 from jaxpg.run.agents import Agents, agents_of, with_values
 from jaxpg.run.config import Config
+from jaxpg.run.schedule import plan
+from jaxpg.run.sigma import labels, left_alone, log_sigma, with_sigma
 from jaxpg.run.state import Policy, RunState, current_policy, is_key, start
 from jaxpg.run.versions import num_threads
 from jaxpg.soundness import sound
@@ -40,35 +42,6 @@ SELECTION_SEED = 2**31
 # Of LLVM. With 3, XLA's default, a training compiles a quarter longer and runs no faster.
 OPTIMIZED, RUN_ONCE = ({"xla_backend_optimization_level": level} for level in (2, 0))
 MAX_FEATURES = 10_000  # a grid over many observations is soon beyond any memory
-
-
-class Schedule(NamedTuple):
-    """How the updates are divided; the host looks between chunks only.
-
-    Attributes:
-      steps_per_update: environment steps of one update (of each agent).
-      chunk: updates between two lines of metrics, which come after each multiple of it and after the last update.
-      num_updates: updates of the whole run, however it is divided.
-      eval_every, checkpoint_every: in chunks.
-    """
-
-    steps_per_update: int
-    chunk: int
-    num_updates: int
-    eval_every: int
-    checkpoint_every: int
-
-    @property
-    def total_steps(self) -> int:
-        return self.num_updates * self.steps_per_update
-
-    def is_due(self, update: int, every: int) -> bool:
-        """Whether something done every `every` chunks is due after `update` updates; at the end it always is."""
-        return update >= self.num_updates or update % (self.chunk * every) == 0
-
-    def until_next_line(self, update: int) -> int:
-        """Updates from `update` to the next line of metrics; also from within a chunk, where a run may have stopped."""
-        return min(self.chunk - update % self.chunk, self.num_updates - update)
 
 
 class Program(NamedTuple):
@@ -85,47 +58,6 @@ class Program(NamedTuple):
     advance: Callable[..., tuple[TrainState, Metrics]]
     evaluate: Callable[[Policy], Episodes]
     state_shape: RunState
-
-
-def plan(config: Config) -> Schedule:
-    """The updates of a run: its steps rounded up to whole updates, and intervals to whole updates and chunks."""
-    run = config.run
-    steps_per_update = run.num_envs * run.num_steps
-    num_updates = _ceil(run.total_steps, steps_per_update)
-    chunk = min(_ceil(run.log_interval, steps_per_update), num_updates)
-    return Schedule(
-        steps_per_update=steps_per_update,
-        chunk=chunk,
-        num_updates=num_updates,
-        eval_every=_ceil(run.eval_interval, chunk * steps_per_update),
-        checkpoint_every=_ceil(run.checkpoint_interval, chunk * steps_per_update),
-    )
-
-
-def described_jump(before: Config, after: Config, update: int) -> str | None:
-    """What jumps where a run goes on with another total, in words; None where nothing does.
-
-    Step sizes and sigma are at any update where a run of the new total, asked for from the beginning, has them.
-
-    Args:
-      before, after: the configuration up to now and from now on.
-      update: updates made.
-    """
-    was, now = (min(update / plan(config).num_updates, 1.0) for config in (before, after))
-    if was == now:
-        return None
-    jumps = []
-    final_lr, network = getattr(after.algo, "final_lr", 1.0), after.network
-    if "algo.final_lr" in after.sweep:
-        jumps.append("step sizes jump")
-    elif final_lr != 1:
-        shares = [f"{1 - (1 - final_lr) * progress:.1%}" for progress in (now, was)]
-        jumps.append(f"step sizes are {shares[0]} of the first, not {shares[1]}")
-    if network.sigma_is == "scheduled":
-        ratio = network.final_sigma / network.sigma
-        sigmas = [f"{network.sigma * ratio**progress:.3g}" for progress in (now, was)]
-        jumps.append(f"sigma is {sigmas[0]}, not {sigmas[1]}")
-    return f"from here on as in a run of {plan(after).total_steps:,} steps: {'; '.join(jumps)}" if jumps else None
 
 
 def make_env(config: Config) -> Any:
@@ -222,57 +154,7 @@ def make_optimizer(config: Config) -> optax.GradientTransformation:
     optimizers = {"actor": adam(algo.actor_lr), "critic": adam(algo.critic_lr)}
     if config.network.sigma_is != "scheduled":
         return optax.multi_transform(optimizers, {"actor": "actor", "critic": "critic"})
-    return optax.multi_transform(optimizers | {"sigma": left_alone()}, _labels)
-
-
-def left_alone() -> optax.GradientTransformation:
-    """No step, for parameters that something else sets; the state is a number of steps, as it has always been."""
-
-    def init(params):
-        return jnp.zeros((), jnp.int32)
-
-    def update(gradients, count, params=None):
-        return jax.tree.map(jnp.zeros_like, gradients), count + 1
-
-    return optax.GradientTransformation(init, update)
-
-
-def log_sigma(config: Config) -> optax.Schedule:
-    """log sigma after some updates of the run: from the first value to the last in equal steps, and no further."""
-    first, last = np.log(config.network.sigma), np.log(config.network.final_sigma)
-    return optax.linear_schedule(first, last, plan(config).num_updates)
-
-
-def with_sigma(algorithm: Algorithm, log_sigma: optax.Schedule) -> Algorithm:
-    """The algorithm whose policy has log sigma = `log_sigma(n)` after n updates, whatever its gradients and its past.
-
-    The optimizer does not do it: steps that it does not take, and updates that are left out, would hold it up.
-    """
-
-    def settled(state: TrainState) -> TrainState:
-        value = log_sigma(state.update)
-        set_sigma = lambda path, x: jnp.full_like(x, value) if _is_sigma(path) else x  # noqa: E731
-        return state._replace(params=jax.tree_util.tree_map_with_path(set_sigma, state.params))
-
-    def step(state: TrainState, key: jax.Array) -> tuple[TrainState, Metrics]:
-        state, metrics = algorithm.step(settled(state), key)
-        return settled(state), metrics
-
-    return Algorithm(algorithm.init, step)
-
-
-def _is_sigma(path: Any) -> bool:
-    """Whether this is the place of a sigma that does not depend on the state, among the parameters."""
-    return jax.tree_util.keystr(path).endswith("['log_std']")
-
-
-def _labels(params: Any) -> Any:
-    """Which optimizer each parameter has, where sigma has one of its own."""
-
-    def label(path, _):
-        return "sigma" if _is_sigma(path) else path[0].key
-
-    return jax.tree_util.tree_map_with_path(label, params)
+    return optax.multi_transform(optimizers | {"sigma": left_alone()}, labels)
 
 
 def compile_program(
@@ -297,8 +179,36 @@ def compile_program(
       resumed: the state comes from a checkpoint; `init` is not compiled.
       meanwhile: called once while XLA compiles in other threads.
     """
-    run, agents = config.run, agents or agents_of(config)
-    networks = make_networks(config, env)
+    size, agents = config.run.vmap_seeds, agents or agents_of(config)
+    init, advance, play = (over_agents(fn, size) for fn in _of_one_agent(config, env, chunk))
+    of_group = jax.tree.map(lambda x: x[:size], agents)
+    init = jax.jit(init).trace(of_group)
+    shape = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype), init.out_info)
+    with _compilers() as pool:
+        # Tracing holds Python's lock and compiling does not: one trace after the other, that of the longest compilation
+        # first, so that no compilation waits for another one's trace.
+        advance = pool.submit(jax.jit(advance).lower(of_group, shape.train, number=chunk).compile, OPTIMIZED)
+        init = None if resumed else pool.submit(init.lower().compile, RUN_ONCE)
+        play = pool.submit(jax.jit(play).lower(current_policy(shape.train)).compile, OPTIMIZED)
+        meanwhile()
+    at_once = groups_at_once(config)
+    init, advance, play = (in_groups(fn.result(), size, at_once) if fn else None for fn in (init, advance, play))
+
+    def advance_by(train, number=chunk):
+        train, metrics = advance(agents, train, number=number)
+        return train, {name: np.asarray(x)[:, :number] for name, x in metrics.items()}
+
+    return Program(
+        functools.partial(init, agents) if init else None,
+        advance_by,
+        play,
+        jax.tree.map(lambda x: jax.ShapeDtypeStruct((len(agents.seed), *x.shape[1:]), x.dtype), shape),
+    )
+
+
+def _of_one_agent(config: Config, env: Any, chunk: int) -> tuple[Callable, Callable, Callable]:
+    """`init(agent)`, `advance(agent, train, number)` and `play(policy)`, to be traced."""
+    run, networks = config.run, make_networks(config, env)
 
     def algorithm(agent):
         return sound(make_algorithm(with_values(config, agent.values), env), run.nan_policy)
@@ -318,32 +228,7 @@ def compile_program(
         parts = math.gcd(run.eval_episodes, config.num_shards)
         return shards.in_parts(play_from, parts, jax.devices())(policy, starts)
 
-    init, advance, play = (over_agents(fn, run.vmap_seeds) for fn in (init, advance, play))
-    of_group = jax.tree.map(lambda x: x[: run.vmap_seeds], agents)
-    init = jax.jit(init).trace(of_group)
-    shape = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype), init.out_info)
-    with _compilers() as pool:
-        # Tracing holds Python's lock and compiling does not: one trace after the other, that of the longest compilation
-        # first, so that no compilation waits for another one's trace.
-        advance = pool.submit(jax.jit(advance).lower(of_group, shape.train, number=chunk).compile, OPTIMIZED)
-        init = None if resumed else pool.submit(init.lower().compile, RUN_ONCE)
-        play = pool.submit(jax.jit(play).lower(current_policy(shape.train)).compile, OPTIMIZED)
-        meanwhile()
-    at_once = groups_at_once(config)
-    init, advance, play = (
-        in_groups(fn.result(), run.vmap_seeds, at_once) if fn else None for fn in (init, advance, play)
-    )
-
-    def advance_by(train, number=chunk):
-        train, metrics = advance(agents, train, number=number)
-        return train, {name: np.asarray(x)[:, :number] for name, x in metrics.items()}
-
-    return Program(
-        functools.partial(init, agents) if init else None,
-        advance_by,
-        play,
-        jax.tree.map(lambda x: jax.ShapeDtypeStruct((len(agents.seed), *x.shape[1:]), x.dtype), shape),
-    )
+    return init, advance, play
 
 
 @contextlib.contextmanager
@@ -417,7 +302,3 @@ def in_groups(compiled: Compiled, size: int, at_once: int) -> Callable:
 def _on_host(x: Any) -> Any:
     """As a numpy array, which is divided without compiling anything; random keys stay what they are."""
     return x if is_key(x) else np.asarray(x)
-
-
-def _ceil(a: int, b: int) -> int:
-    return -(-a // b)

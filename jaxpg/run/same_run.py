@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
 from envs.options import OptionError
@@ -21,13 +21,12 @@ RESUMABLE = (
 )
 
 
-def check_options(run_folder: RunFolder, stored: Config, config: Config, names: Iterable[str]) -> None:
-    """Raises UserError where one of these options has changed that would make it another run."""
-    for name, has, given in _differences(stored, config):
-        if name in set(names):
-            raise UserError(
-                f"{given}: {run_folder.path} has {has}, and on resume only {', '.join(RESUMABLE)} may change"
-            )
+def check_options(run_folder: RunFolder, stored: Config, config: Config) -> None:
+    """Raises UserError where an option differs that would make it another run."""
+    differences = _differences(stored, config)
+    if differences:
+        _, has, given = differences[0]
+        raise UserError(f"{given}: {run_folder.path} has {has}, and on resume only {', '.join(RESUMABLE)} may change")
 
 
 def check_checkpoint(checkpoints: Checkpoints, number: int, config: Config) -> None:

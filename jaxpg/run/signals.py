@@ -81,4 +81,5 @@ class StopRequests:
 
     def _note(self, number: int, frame: FrameType | None) -> None:
         self.signal = signal.Signals(number)
-        signal.signal(signal.SIGINT, self._before.get(signal.SIGINT, signal.default_int_handler))
+        if signal.SIGINT in self._before:
+            signal.signal(signal.SIGINT, self._before[signal.SIGINT])

@@ -160,7 +160,7 @@ def improvement_interval(x: np.ndarray, y: np.ndarray, confidence: float = CONFI
         |P - P_found| = z sqrt(V(P)),    V(P) = P (1 - P) (1 + M (1 - P) / (2 - P) + M P / (1 + P)) / (S R)
         M = (S + R) / 2 - 1,    z: the normal distribution's quantile at (1 + confidence) / 2
 
-    Other than a bootstrap it is no point where all of X are better than all of Y.
+    Unlike a bootstrap interval it does not shrink to a point where all of X are better than all of Y.
 
     Args:
       x, y: a score for each seed, `[S]` and `[R]`.

@@ -39,7 +39,7 @@ def page(data: Mapping[str, Any]) -> str:
     Its Content-Security-Policy lets the browser run this style and this script, by their digests, and load nothing.
 
     Args:
-      data: of a run (`jaxpg.watch.report`) or of a comparison (`jaxpg.watch.compare`): plain values, finite or None.
+      data: of a run (`jaxpg.watch.report`) or of a comparison (`jaxpg.watch.comparison`): plain values, finite or None.
 
     Raises:
       ValueError: a number that is not finite.

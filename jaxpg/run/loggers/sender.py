@@ -22,6 +22,7 @@ from jaxpg.run.loggers import SERVICES, Service, values_of
 
 ERROR = "error: "  # begins the line that says why it failed
 LONGEST = 600  # seconds that it goes on after the training has ended
+NOT_SENT = ("program",)  # of config.yaml: a path on this machine is no option of the run
 
 
 def main(arguments: Sequence[str]) -> int:
@@ -77,9 +78,10 @@ def _only_ours(descriptor: int) -> int:
 
 
 def _read(config: Path) -> dict:
-    import yaml
+    from jaxpg.run import plain_yaml
 
-    return yaml.safe_load(config.read_text(encoding="utf-8"))
+    values = plain_yaml.load(config.read_text(encoding="utf-8"))
+    return {name: value for name, value in values.items() if name not in NOT_SENT}
 
 
 def _first_line(error: Exception) -> str:
