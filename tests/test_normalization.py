@@ -7,7 +7,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from jaxpg.normalization import init, normalize, update
+from jaxpg import normalization
+from jaxpg.normalization import init, normalize
+
+update = jax.jit(normalization.update)  # whose branches would be compiled anew at each call
 
 # few sizes, so that few shapes are compiled
 batch_sizes = st.lists(st.sampled_from([1, 2, 5, 16]), min_size=1, max_size=6)

@@ -145,8 +145,8 @@ def test_a_robot_without_visible_geoms_is_drawn_all_the_same(shown, xml):
 @pytest.mark.parametrize(
     ("commands", "names"),
     [
-        (("torque", "torque"), ["torque", "torque (2)"]),
-        (("reward", "value"), ["reward (2)", "value (2)"]),
+        (("torque", "torque"), ["torque (1)", "torque (2)"]),
+        (("reward", "value"), ["reward (1)", "value (2)"]),
         (("only one",), ["action 1", "action 2"]),
         (["a", 3], ["a", "3"]),
     ],
