@@ -75,11 +75,10 @@ def damage(path, kind, position, other, outside):
             path.write_bytes(altered(path.read_bytes(), kind, position))
         return
     copy = Path(tempfile.mkdtemp(dir=outside), path.name)
-    if path.exists():
-        (shutil.copytree if path.is_dir() else shutil.copyfile)(path, copy)
+    make_copy(path, copy)
     remove(path)
-    if kind == "of another run" and other.exists():
-        (shutil.copytree if other.is_dir() else shutil.copyfile)(other, path)
+    if kind == "of another run":
+        make_copy(other, path)
     elif kind == "folder":
         path.mkdir()
     elif kind == "file":
@@ -89,6 +88,14 @@ def damage(path, kind, position, other, outside):
     elif "link" in kind:
         targets = {"link to a copy": copy, "link to a file": outside / "file", "link to a folder": outside / "folder"}
         path.symlink_to(targets.get(kind, outside / "missing" if kind == "dangling link" else path))
+
+
+def make_copy(path, to):
+    """Of a file or folder, if there is one; but for what damages before have made unreadable."""
+    if path.is_dir():
+        shutil.copytree(path, to, symlinks=True, ignore=lambda at, names: [x for x in names if Path(at, x).is_socket()])
+    elif path.is_file():
+        shutil.copyfile(path, to)
 
 
 def is_own(path, run):
