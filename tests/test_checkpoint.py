@@ -27,3 +27,12 @@ def test_keys_of_another_generator_are_of_another_program(tmp_path):
     checkpoints.save(1, {"key": jax.random.key(3)}, {})
     with pytest.raises(CheckpointError, match="made by another program"):
         checkpoints.restore(1, {"key": jax.random.key(3, impl="rbg")})
+
+
+@pytest.mark.parametrize("kind", ["file", "dangling link"])
+def test_what_is_no_checkpoint_is_in_no_ones_way(kind, tmp_path):
+    checkpoints = Checkpoints(tmp_path / "best")
+    make = {"file": lambda x: x.write_text("5"), "dangling link": lambda x: x.symlink_to("missing")}
+    make[kind](tmp_path / "best" / "3")
+    checkpoints.replace(3, {"x": jnp.arange(4.0)}, {})
+    np.testing.assert_array_equal(checkpoints.read(3)["x"], np.arange(4.0))

@@ -149,7 +149,14 @@ class Checkpoints:
         with self._writing(step):
             for later in [number for number in self.numbers() if number >= step]:
                 self._manager.delete(later)
+            self._make_way(step)
         self.save(step, tree, meta)
+
+    def _make_way(self, step: int) -> None:
+        """Removes what has the number's name and is no folder: orbax does not see it, and could not save there."""
+        place = self._place / str(step)
+        if os.path.lexists(place) and (place.is_symlink() or not place.is_dir()):
+            place.unlink()
 
     @contextlib.contextmanager
     def _writing(self, step: int) -> Iterator[None]:
