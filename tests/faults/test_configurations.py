@@ -11,8 +11,9 @@ import typing
 
 import jax
 import pytest
-from hypothesis import HealthCheck, Phase, given, seed, settings
+from hypothesis import given
 from hypothesis import strategies as st
+from rounds import examples, rounds
 
 from jaxpg import train
 from jaxpg.run import cache, program
@@ -73,20 +74,11 @@ def quick_to_compile(monkeypatch, tmp_path):
     monkeypatch.setattr(cache, "cache_folder", lambda: tmp_path / "cache" / "jaxpg")
 
 
-@pytest.mark.parametrize(
-    "number", [pytest.param(i, marks=[] if i < FEW else [pytest.mark.faults]) for i in range(MANY)]
-)
+@rounds(FEW, MANY)
 def test_random_configurations(number, monkeypatch, capsys, tmp_path):
     ended = {0: 0, 2: 0, 4: 0}
 
-    @seed(number)
-    @settings(
-        max_examples=50 if number else 6,
-        deadline=None,
-        database=None,
-        phases=[Phase.generate],
-        suppress_health_check=list(HealthCheck),
-    )
+    @examples(number, 50 if number else 6)
     @given(command_lines())
     def attempt(arguments):
         folder = tmp_path / f"run-{sum(ended.values())}"

@@ -19,8 +19,9 @@ import numpy as np
 import pytest
 from environments import Config
 from flax import struct
-from hypothesis import HealthCheck, Phase, given, note, seed, settings
+from hypothesis import given, note
 from hypothesis import strategies as st
+from rounds import examples, rounds
 
 import envs
 from envs.base import Interface, State
@@ -228,20 +229,11 @@ def quick_to_compile(monkeypatch, tmp_path):
     monkeypatch.setattr(cache, "cache_folder", lambda: tmp_path / "cache" / "jaxpg")
 
 
-@pytest.mark.parametrize(
-    "number", [pytest.param(i, marks=[] if i < FEW else [pytest.mark.faults]) for i in range(MANY)]
-)
+@rounds(FEW, MANY)
 def test_random_environments(number, capfd, tmp_path):
     counts, folders = {0: 0, 2: 0, 4: 0}, (tmp_path / f"run-{i}" for i in itertools.count())
 
-    @seed(number)
-    @settings(
-        max_examples=20 if number else 12,
-        deadline=None,
-        database=None,
-        phases=[Phase.generate],
-        suppress_health_check=list(HealthCheck),
-    )
+    @examples(number, 20 if number else 12)
     @given(descriptions())
     def attempt(about):
         note(f"python tests/faults/test_environments.py {shlex.quote(json.dumps(about))}")
