@@ -14,8 +14,10 @@ import jax.numpy as jnp
 from jaxpg import collectives
 from jaxpg.shapes import select
 
+ERRORS = 6.0  # standard errors by which the scale of few samples may be larger than it looks
 REACH = 10.0  # deviations within which a sample is taken as it is
 TYPICAL = 1.887  # deviation over geometric mean distance, of a Gaussian: exp((log 2 + Euler's gamma) / 2)
+SPREAD = 1.111  # deviation of log |x| of a Gaussian: pi / sqrt(8)
 ROUNDING = 8.0  # units in the last place of the mean that are no variation
 
 
@@ -102,16 +104,20 @@ def _middle(samples: jax.Array, counts: jax.Array, number: int = 256) -> jax.Arr
 def _reach(statistics: RunningStatistics, weight: jax.Array, away: jax.Array, axis_name: str | None) -> jax.Array:
     """How far from the mean a sample is taken as it is, `[size]`.
 
-        l = 10 max(s, s^(1 - a) s_b^a),    s = sqrt(v),    s_b = 1.887 exp(mean log |x - m|),    a = min(1, 10 w)
+        l = 10 max(s, s^(1 - a) s_b^a),    s = sqrt(v),    a = min(1, 10 w)
+        s_b = 1.887 exp(mean log |x - m| + 6 (1.111 / sqrt(k)))
 
     s_b is the batch's own scale, by the geometric mean: that of a few enormous samples among many is that of the many.
-    Alone it decides as long as there is no variation, and as long as the batch is a tenth of all samples.
+    Of k samples it is as large as six standard errors of the mean of logarithms allow: in a batch of five, three may
+    lie close together by chance. Alone it decides as long as there is no variation, and as long as the batch is a tenth
+    of all samples.
     """
     moved = away != 0
     logarithms = jnp.where(moved, jnp.log(jnp.abs(jnp.where(moved, away, 1.0))), 0.0)
     sums = jnp.stack([jnp.sum(logarithms, axis=0), jnp.sum(moved, axis=0, dtype=away.dtype)])
     total, number = collectives.total(sums, axis_name)
-    own = jnp.log(TYPICAL) + total / jnp.maximum(number, 1)
+    number = jnp.maximum(number, 1)
+    own = jnp.log(TYPICAL) + total / number + ERRORS * SPREAD * jax.lax.rsqrt(number)
     known = (statistics.count > 0) & (statistics.variance > 0)
     so_far = jnp.where(known, 0.5 * jnp.log(jnp.where(known, statistics.variance, 1.0)), own)
     trust = jnp.minimum(1.0, 10 * weight)
