@@ -18,8 +18,8 @@ ENVIRONMENTS = (("jaxpg/Pendulum-v0", "pendulum", 200), ("jaxpg/Arm-v0", "arm", 
 for name, env, max_episode_steps in ENVIRONMENTS:
     gymnasium.register(
         name,
-        entry_point="envs.gymnasium_env:make",
-        vector_entry_point="envs.gymnasium_env:make_vec",
+        entry_point="jaxpg.gymnasium_env:make",
+        vector_entry_point="jaxpg.gymnasium_env:make_vec",
         max_episode_steps=max_episode_steps,
         kwargs={"env": env},
     )

@@ -18,9 +18,9 @@ from hypothesis import strategies as st
 import envs
 from envs.base import Interface, State, interface
 from envs.contract import conform
-from envs.gymnasium_env import Single
 from envs.options import OptionError
 from jaxpg import train
+from jaxpg.gymnasium_env import Single
 from jaxpg.run.errors import run_command
 
 

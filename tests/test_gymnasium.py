@@ -11,14 +11,15 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from exploding import Blind, ExplodingConfig
 from gymnasium.utils.env_checker import check_env
 from gymnasium.vector import AutoresetMode
 from probes import Counter
 
 import envs
 import jaxpg.gymnasium
-from envs.gymnasium_env import Batch, Single, make
 from envs.options import OptionError, option
+from jaxpg.gymnasium_env import Batch, Single, make
 
 ROOT = Path(__file__).parent.parent
 PENDULUM, ARM = "jaxpg/Pendulum-v0", "jaxpg/Arm-v0"
@@ -198,6 +199,14 @@ def test_a_physics_that_diverges_ends_its_episode():
     after, reward, terminated, _, _ = single.step(np.zeros(1))
     np.testing.assert_array_equal(after, before)
     assert (reward, terminated) == (0, True)
+
+
+def test_a_physics_that_diverges_out_of_sight_ends_its_episode():
+    """Only the angle tells, which grows tenfold with each step; what is seen and paid are its sine."""
+    env = Single(Blind(ExplodingConfig(share=1.0)))
+    env.reset(seed=0)
+    ends = [env.step(np.zeros(1))[2] for _ in range(12)]
+    assert ends.index(True) in (9, 10, 11)
 
 
 def test_spaces_of_environments_that_do_not_say():

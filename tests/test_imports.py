@@ -28,7 +28,7 @@ LEVELS = [
     {"networks", "vector_env"},
     {"rollout", "learning", "actor_critic", "online", "training", "soundness", "shards", "evaluation"},
     {"run", "deploy", "watch", "train", "evaluate", "inspect", "export", "render", "report", "compare"}
-    | {"__main__", "gymnasium"},
+    | {"__main__", "gymnasium", "gymnasium_env"},
 ]
 FOREIGN = {0: {"jax"}, 1: {"jax", "flax"}, 2: {"jax", "optax"}}
 

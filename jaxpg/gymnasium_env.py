@@ -29,8 +29,9 @@ from gymnasium.vector.utils import batch_space
 import envs
 from envs.base import interface, with_fields
 from envs.options import OptionError, build
+from jaxpg.divergence import diverged
+from jaxpg.shapes import select
 
-LARGEST = 1e10  # as in training, after MuJoCo's mjMAXVAL
 KEPT = 8  # environments that are shared
 
 
@@ -172,23 +173,18 @@ def compiled(env: Any) -> Compiled:
 
 
 def finite_step(env: Any, state: Any, action: jax.Array) -> Any:
-    """The environment's step; a physics that diverges is the end: the observation before it, no reward, terminated.
+    """The environment's step; physics that diverges ends the episode: the observation before it, no reward, terminated.
 
-    What is not finite or beyond `LARGEST` counts as diverged.
+    When that is, `jaxpg.divergence.diverged` says, as in training.
     """
     after = env.step(state, action)
-    sound = (jnp.abs(after.obs) <= LARGEST).all() & (jnp.abs(after.reward) <= LARGEST) & jnp.isfinite(after.done)
+    exploded = diverged(state, after)
     return with_fields(
         after,
-        obs=jnp.where(sound, after.obs, state.obs),
-        reward=jnp.where(sound, after.reward, 0.0),
-        done=jnp.where(sound, after.done, 1.0),
+        obs=jnp.where(exploded, state.obs, after.obs),
+        reward=jnp.where(exploded, 0.0, after.reward),
+        done=jnp.where(exploded, 1.0, after.done),
     )
-
-
-def select(mask: jax.Array, if_true: Any, if_false: Any) -> Any:
-    """Leaf by leaf along the leading axis: `if_true` where the mask holds."""
-    return jax.tree.map(lambda a, b: jnp.where(mask.reshape(-1, *[1] * (a.ndim - 1)), a, b), if_true, if_false)
 
 
 def start_seed(seed: int | None, random: np.random.Generator) -> np.uint32:
