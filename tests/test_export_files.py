@@ -88,8 +88,9 @@ def test_links_are_not_followed(export, tmp_path):
     assert (elsewhere / "main.c").read_bytes() == before
 
 
+@pytest.mark.parametrize("out", ["", "export", "export/robot", "export/robot/left"])
 @pytest.mark.usefixtures("export")
-def test_a_link_in_the_place_of_a_runs_folder_is_not_followed(tmp_path):
+def test_a_link_in_the_place_of_a_runs_folder_is_not_followed(out, tmp_path):
     run, elsewhere = tmp_path / "run", tmp_path / "elsewhere"
     run.mkdir()
     elsewhere.mkdir()
@@ -97,7 +98,7 @@ def test_a_link_in_the_place_of_a_runs_folder_is_not_followed(tmp_path):
     (run / "best").mkdir()
     (run / "export").symlink_to(elsewhere)
     with pytest.raises(UserError, match="it is a link"):
-        command_line.main([f"run={run}", "overwrite=true"])
+        command_line.main([f"run={run}", "overwrite=true", *[f"out={run / out}"] * bool(out)])
     assert not [*elsewhere.iterdir()]
 
 

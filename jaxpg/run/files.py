@@ -11,7 +11,7 @@ import errno
 import os
 import secrets
 import stat
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import BinaryIO
 
@@ -80,11 +80,11 @@ def opened(folder: Path, make: bool = False) -> Iterator[int]:
     """A descriptor of a folder, inside.
 
     Args:
-      folder: any; links that lead to it are followed, but not one that stands for it in a run folder.
+      folder: any; links that lead to it are followed, but none inside a run folder.
       make: where there is none; not those above it.
 
     Raises:
-      OSError: there is none, or it is a link inside a run folder.
+      OSError: there is none, or there is a link on the way to it inside a run folder.
     """
     descriptor = open_folder(folder, make)
     try:
@@ -95,22 +95,39 @@ def opened(folder: Path, make: bool = False) -> Iterator[int]:
 
 def open_folder(folder: Path, make: bool = False) -> int:
     """As `opened`; to be closed."""
+    name = Path(os.path.abspath(folder))
     for root, owner in tuple(_owned.items()):  # other threads may begin and end runs meanwhile
-        if Path(os.path.abspath(folder)).is_relative_to(root):
-            return _open_own(os.path.relpath(folder, root), owner, make)
-    if all(os.path.lexists(folder.parent / name) for name in ("config.yaml", "best")):
-        return _open_own(os.path.abspath(folder), None, make)
+        if name.is_relative_to(root):
+            return _open_below(owner, name.relative_to(root).parts, make)
+    run = next((above for above in name.parents if _is_run(above)), None)
+    if run:
+        root = os.open(run, FOLDER)
+        try:
+            return _open_below(root, name.relative_to(run).parts, make)
+        finally:
+            os.close(root)
     if make:
         folder.mkdir(exist_ok=True)
     return os.open(folder, FOLDER)
 
 
-def _open_own(name: str, parent: int | None, make: bool) -> int:
-    """A folder of a run."""
-    if make:
-        with contextlib.suppress(FileExistsError):
-            os.mkdir(name, dir_fd=parent)
-    return _open(name, FOLDER, parent)
+def _is_run(folder: Path) -> bool:
+    return all(os.path.lexists(folder / name) for name in ("config.yaml", "best"))
+
+
+def _open_below(root: int, names: Sequence[str], make: bool) -> int:
+    """A folder below that of a run, by way of folders that are no links; the last one is made if need be."""
+    descriptor = os.dup(root)
+    for place, name in enumerate(names, 1):
+        try:
+            if make and place == len(names):
+                with contextlib.suppress(FileExistsError):
+                    os.mkdir(name, dir_fd=descriptor)
+            below = _open(name, FOLDER, descriptor)
+        finally:
+            os.close(descriptor)
+        descriptor = below
+    return descriptor
 
 
 def _open(name: str, flags: int, parent: int | None) -> int:
