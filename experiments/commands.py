@@ -15,10 +15,10 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from jaxpg.run.errors import UserError
-from jaxpg.run.figures import draw_curve, series
-from jaxpg.run.folder import RunFolder, read_metrics
-from jaxpg.run.statistics import bootstrap_interval, interquartile_mean
+from jaxpg.errors import UserError
+from jaxpg.store.folder import RunFolder, read_metrics
+from jaxpg.store.statistics import bootstrap_interval, interquartile_mean
+from jaxpg.watch.figures import draw_curve, series
 
 RESULTS = Path(__file__).parent / "results"
 

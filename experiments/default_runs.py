@@ -20,7 +20,7 @@ from pathlib import Path
 from commands import Parser, evaluate, train, write_json
 
 from envs.options import unknown
-from jaxpg.run.errors import run_command
+from jaxpg.commands.ending import run_command
 
 PENDULUM_RUNS = {"default": ((), 10), "TD": (("algo=td",), 5), "TD(0)": (("algo=td", "algo.lambda_=0"), 5)}  # seeds
 ARM_RUNS = [{"seed": str(seed)} for seed in range(3)] + [

@@ -25,11 +25,11 @@ import jax
 import numpy as np
 from commands import Parser, evaluate, largest_difference, train, write_json
 
+from jaxpg.commands.ending import run_command
 from jaxpg.deploy import c, onnx
 from jaxpg.deploy.controller import commanding, controller, observations
 from jaxpg.deploy.export import FORMATS
-from jaxpg.run import policies
-from jaxpg.run.errors import run_command
+from jaxpg.store import policies
 
 TASK = "pendulum"
 POLICIES = ("jax", "c", "onnx")

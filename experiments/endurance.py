@@ -22,9 +22,9 @@ import numpy as np
 from commands import Parser, duration, write_figure, write_json
 from matplotlib.figure import Figure
 
-from jaxpg.run.config import compose
-from jaxpg.run.errors import run_command
-from jaxpg.run.folder import RunFolder, read_metrics
+from jaxpg.commands.ending import run_command
+from jaxpg.config.parsing import compose
+from jaxpg.store.folder import RunFolder, read_metrics
 
 WARM_UP = 1 / 60  # of the time; compiling and the first evaluation and checkpoint are over by then
 SAMPLES = 360

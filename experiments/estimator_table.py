@@ -19,7 +19,7 @@ import numpy as np
 from commands import Parser, write_json
 from linear_quadratic import closed_form, ladder, setting, study
 
-from jaxpg.run.errors import run_command
+from jaxpg.commands.ending import run_command
 
 NUM_BATCHES = 20
 SIZES = (1, 3)

@@ -33,7 +33,7 @@ from linear_quadratic import (
 )
 from matplotlib.figure import Figure
 
-from jaxpg.run.errors import run_command
+from jaxpg.commands.ending import run_command
 
 VARIABLES = 3
 NUM_EPISODES = 204_800

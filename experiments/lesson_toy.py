@@ -26,14 +26,15 @@ from commands import Parser, write_figure, write_json
 from matplotlib.figure import Figure
 
 from envs.quadratic import LinearQuadratic, Policy, QuadraticConfig, best_policy, chain, objective
+from jaxpg.commands.ending import run_command
+from jaxpg.config.parsing import compose
 from jaxpg.distributions import gaussian_log_prob, gaussian_sample
 from jaxpg.estimators import reinforce
 from jaxpg.networks import linear_mean
+from jaxpg.program.algorithms import make_algorithm
+from jaxpg.program.environment import make_env
+from jaxpg.program.schedule import plan
 from jaxpg.rollout import rollout
-from jaxpg.run.config import compose
-from jaxpg.run.errors import run_command
-from jaxpg.run.program import make_algorithm, make_env
-from jaxpg.run.schedule import plan
 from jaxpg.training import initial_state, train_scan
 from jaxpg.vector_env import vectorize
 

@@ -31,12 +31,13 @@ import jax
 import numpy as np
 from commands import Parser, largest_difference, train, write_json
 
+from jaxpg.commands.ending import run_command
 from jaxpg.deploy import c, learning
 from jaxpg.deploy.controller import Controller, commanding, controller, observations
-from jaxpg.run import policies
-from jaxpg.run.errors import UserError, run_command
-from jaxpg.run.policies import StoredPolicy
-from jaxpg.run.program import make_networks
+from jaxpg.errors import UserError
+from jaxpg.program.networks import make_networks
+from jaxpg.store import policies
+from jaxpg.store.policies import StoredPolicy
 
 SOURCES = Path(__file__).parent / "microcontroller"
 COMPILER, SIZE, QEMU = "arm-none-eabi-gcc", "arm-none-eabi-size", "qemu-system-arm"

@@ -23,14 +23,15 @@ import numpy as np
 from commands import Parser, write_figure, write_json
 from matplotlib.figure import Figure
 
-from jaxpg.run.agents import agents_of
-from jaxpg.run.config import compose
-from jaxpg.run.errors import run_command
-from jaxpg.run.figures import draw_curve
-from jaxpg.run.program import make_algorithm, make_env
-from jaxpg.run.schedule import plan
-from jaxpg.run.statistics import interquartile_mean
+from jaxpg.commands.ending import run_command
+from jaxpg.config.parsing import compose
+from jaxpg.program.agents import agents_of
+from jaxpg.program.algorithms import make_algorithm
+from jaxpg.program.environment import make_env
+from jaxpg.program.schedule import plan
+from jaxpg.store.statistics import interquartile_mean
 from jaxpg.training import train_scan
+from jaxpg.watch.figures import draw_curve
 
 NUM_SEEDS = 5
 POINTS = 40  # of a curve

@@ -33,7 +33,7 @@ from commands import Parser, count, write_json
 import envs
 from envs.base import ASSETS
 from envs.physics import compile_step, load_spec
-from jaxpg.run.errors import run_command
+from jaxpg.commands.ending import run_command
 
 SECONDS = 0.3  # that one measurement lasts, at least
 MJX_PANDAS = 1  # environments up to which mjx.step of the seven-joint arm is measured

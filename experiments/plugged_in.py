@@ -32,7 +32,7 @@ from typing import Any
 import commands
 from commands import Parser, count, write_json
 
-from jaxpg.run.errors import run_command
+from jaxpg.commands.ending import run_command
 
 ROOT = Path(__file__).parents[1]
 PEERS = Path(__file__).parent / "peers"

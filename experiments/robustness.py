@@ -24,8 +24,8 @@ from typing import Any
 from commands import Parser, train, write_json
 from startup import measure
 
-from jaxpg.run.errors import run_command
-from jaxpg.run.folder import RunFolder, read_metrics
+from jaxpg.commands.ending import run_command
+from jaxpg.store.folder import RunFolder, read_metrics
 
 TASKS = {"pendulum": ("env=pendulum",), "arm": ("env=arm",)}
 STOPS = 10

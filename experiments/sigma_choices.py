@@ -17,7 +17,7 @@ from pathlib import Path
 from commands import Parser, learning_curve, train, write_figure, write_json
 from matplotlib.figure import Figure
 
-from jaxpg.run.errors import run_command
+from jaxpg.commands.ending import run_command
 
 TASK = "pendulum"
 NUM_SEEDS = 5

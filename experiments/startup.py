@@ -23,18 +23,18 @@ from typing import Any
 
 from commands import Parser, write_json
 
-from jaxpg.run.errors import run_command
+from jaxpg.commands.ending import run_command
 
 ARGUMENTS = ("env=pendulum",)
 MEASURED = "--measured"  # a process of this script that is the command, and notes where its time goes
-# Phases by what is called in them, of `jaxpg.run`.
+# Phases by what is called in them, of `jaxpg`.
 PHASES = {
-    "options": ("config.compose",),
-    "environment": ("session._env",),
-    "tracing and compiling": ("session._compile",),
-    "evaluations": ("loop._evaluate",),
-    "checkpoints": ("keeper.Keeper.__init__", "keeper.Keeper.save"),
-    "figure": ("closing.draw_learning_curve",),
+    "options": ("config.parsing.compose",),
+    "environment": ("run.session._env",),
+    "tracing and compiling": ("run.session._compile",),
+    "evaluations": ("run.loop._evaluate",),
+    "checkpoints": ("store.keeper.Keeper.__init__", "store.keeper.Keeper.save"),
+    "figure": ("watch.closing.draw_learning_curve",),
 }
 TRACING = ("jaxpr_trace_duration", "jaxpr_to_mlir_module_duration")
 PROGRAMS = {name for program in ("init", "advance", "play") for name in (program, f"jit({program})")}
@@ -126,17 +126,18 @@ class Stopwatch:
 def measured(report: str, began: float, arguments: list[str]) -> int:
     """The training command with its phases timed."""
     watch = Stopwatch(began)
-    from jaxpg import run
-    from jaxpg.run import session  # and with it all that PHASES names
-    from jaxpg.run.metrics_log import MetricsLog
-    from jaxpg.train import main as train
+    import jaxpg
+    import jaxpg.watch.closing  # and with it all that PHASES names
+    from jaxpg.commands.train import main as train
+    from jaxpg.run import session
+    from jaxpg.store.metrics_log import MetricsLog
 
     watch.add("imports", [0.0, 0.0])
     _listen(watch)
     for phase, names in PHASES.items():
         for name in names:
             owner, _, leaf = name.rpartition(".")
-            watch.watch(operator.attrgetter(owner)(run), leaf, phase)
+            watch.watch(operator.attrgetter(owner)(jaxpg), leaf, phase)
     written = MetricsLog.write
 
     def first(log, line):

@@ -19,15 +19,17 @@ from typing import Any
 import numpy as np
 from commands import Parser, count, write_json
 
-from jaxpg.run.agents import crossed
-from jaxpg.run.config import Config, compose
-from jaxpg.run.errors import run_command
-from jaxpg.run.names import own_metrics
-from jaxpg.run.program import compile_program, make_env
-from jaxpg.run.runtime import prepare
-from jaxpg.run.schedule import plan
-from jaxpg.run.state import current_policy
-from jaxpg.run.sweep import Setting
+from jaxpg.commands.ending import run_command
+from jaxpg.config.configuration import Config
+from jaxpg.config.parsing import compose
+from jaxpg.config.sweep import Setting
+from jaxpg.program.agents import crossed
+from jaxpg.program.backend import prepare
+from jaxpg.program.compile import compile_program
+from jaxpg.program.environment import make_env
+from jaxpg.program.schedule import plan
+from jaxpg.program.state import current_policy
+from jaxpg.store.names import own_metrics
 
 # Drawn log-uniformly between the two; discount and lambda by what they lack of 1.
 RANGES = {

@@ -31,12 +31,15 @@ import jax
 import jax.numpy as jnp
 from commands import Parser, write_json
 
+from jaxpg.commands.ending import run_command
+from jaxpg.config.configuration import Config
+from jaxpg.config.parsing import compose
+from jaxpg.program.algorithms import make_algorithm
+from jaxpg.program.backend import prepare
+from jaxpg.program.compile import compile_program
+from jaxpg.program.environment import make_env
+from jaxpg.program.schedule import plan
 from jaxpg.rollout import rollout
-from jaxpg.run.config import Config, compose
-from jaxpg.run.errors import run_command
-from jaxpg.run.program import compile_program, make_algorithm, make_env
-from jaxpg.run.runtime import prepare
-from jaxpg.run.schedule import plan
 from jaxpg.training import initial_state, train_scan
 from jaxpg.vector_env import vectorize
 

@@ -41,7 +41,7 @@ import numpy as np
 from commands import Parser, count, evaluate, train, write_figure, write_json
 from matplotlib.figure import Figure
 
-from jaxpg.run.errors import run_command
+from jaxpg.commands.ending import run_command
 
 ROOT = Path(__file__).parents[1]
 PEERS = Path(__file__).parent / "peers"

@@ -40,7 +40,7 @@ def load(run: str | os.PathLike[str], checkpoint: str = "best", agent: int | Non
       agent: which of the run's agents, from 0; None takes the best.
 
     Raises:
-      jaxpg.run.errors.UserError: no run folder, no checkpoint in it, no such agent, or an unknown environment.
+      jaxpg.errors.UserError: no run folder, no checkpoint in it, no such agent, or an unknown environment.
     """
     from jaxpg.deploy import policy  # with the environments, slow to import
 

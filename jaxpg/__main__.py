@@ -12,7 +12,8 @@ import importlib
 from collections.abc import Sequence
 
 from envs.options import unknown
-from jaxpg.run.errors import UserError, run_command
+from jaxpg.commands.ending import run_command
+from jaxpg.errors import UserError
 
 VERBS = {
     "train": "trains an agent, or goes on with a run that was stopped",
@@ -34,7 +35,7 @@ def main(arguments: Sequence[str]) -> int:
         return 0
     if verb not in VERBS:
         raise UserError(unknown("command", verb, VERBS))
-    return importlib.import_module(f"jaxpg.{verb}").main(rest)
+    return importlib.import_module(f"jaxpg.commands.{verb}").main(rest)
 
 
 def console_script() -> None:

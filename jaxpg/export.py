@@ -1,23 +1,9 @@
 """`python -m jaxpg.export run=DIR`: the controller that a run has learned, for a robot."""
 
-from __future__ import annotations
+from jaxpg.commands.ending import run_command
+from jaxpg.commands.export import main
 
-from collections.abc import Sequence
-
-from jaxpg.run.commands import about_a_run
-from jaxpg.run.errors import run_command
-from jaxpg.run.schema import ExportOptions
-
-
-def main(arguments: Sequence[str]) -> int:
-    """The export command; returns its exit status."""
-    options = about_a_run("export", ExportOptions, arguments)
-    if options is not None:
-        from jaxpg.deploy import export
-
-        export.export(options, print)
-    return 0
-
+__all__ = ["main"]
 
 if __name__ == "__main__":
     run_command(main)

@@ -1,25 +1,9 @@
 """`python -m jaxpg.inspect run=DIR`: what a run is, how far it is, and whether its checkpoints are sound."""
 
-from __future__ import annotations
+from jaxpg.commands.ending import run_command
+from jaxpg.commands.inspect import main
 
-import json
-from collections.abc import Sequence
-
-from jaxpg.run.commands import about_a_run
-from jaxpg.run.errors import run_command
-from jaxpg.run.schema import InspectOptions
-
-
-def main(arguments: Sequence[str]) -> int:
-    """The inspection command; returns its exit status."""
-    options = about_a_run("inspect", InspectOptions, arguments)
-    if options is not None:
-        from jaxpg.run import inspection
-
-        found = inspection.inspect(options.run)
-        print(json.dumps(inspection.summary(found)) if options.json else inspection.described(found))
-    return 0
-
+__all__ = ["main"]
 
 if __name__ == "__main__":
     run_command(main)

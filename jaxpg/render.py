@@ -1,23 +1,9 @@
 """`python -m jaxpg.render run=DIR`: episodes of a trained policy as a video."""
 
-from __future__ import annotations
+from jaxpg.commands.ending import run_command
+from jaxpg.commands.render import main
 
-from collections.abc import Sequence
-
-from jaxpg.run.commands import about_a_run_in
-from jaxpg.run.errors import run_command
-from jaxpg.run.schema import RenderOptions
-
-
-def main(arguments: Sequence[str]) -> int:
-    """The render command; returns its exit status."""
-    options, changes = about_a_run_in("render", RenderOptions, arguments)
-    if options is not None:
-        from jaxpg.watch import video
-
-        video.render(options, changes, print)
-    return 0
-
+__all__ = ["main"]
 
 if __name__ == "__main__":
     run_command(main)

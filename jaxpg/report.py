@@ -1,23 +1,9 @@
 """`python -m jaxpg.report run=DIR`: the page of a run, which training writes at its end, written anew."""
 
-from __future__ import annotations
+from jaxpg.commands.ending import run_command
+from jaxpg.commands.report import main
 
-from collections.abc import Sequence
-
-from jaxpg.run.commands import about_a_run
-from jaxpg.run.errors import run_command
-from jaxpg.run.schema import ReportOptions
-
-
-def main(arguments: Sequence[str]) -> int:
-    """The report command; returns its exit status."""
-    options = about_a_run("report", ReportOptions, arguments)
-    if options is not None:
-        from jaxpg.watch import report
-
-        report.of_run(options.run, options.agent, options.cache, print)
-    return 0
-
+__all__ = ["main"]
 
 if __name__ == "__main__":
     run_command(main)

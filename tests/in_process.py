@@ -4,7 +4,7 @@ import contextlib
 import io
 import sys
 
-from jaxpg.run.errors import run_command
+from jaxpg.commands.ending import run_command
 
 
 def ended(main, arguments):

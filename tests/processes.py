@@ -11,7 +11,7 @@ import time
 
 import pytest
 
-from jaxpg.run.checkpoint import Checkpoints
+from jaxpg.store.checkpoint import Checkpoints
 
 LINES = 100  # of metrics; a checkpoint after every tenth
 SIZES = ("env=quadratic", "network=linear", "num_envs=2", "num_steps=4", "log_interval=16", "eval_interval=32")

@@ -6,11 +6,11 @@ import jax
 import jax.numpy as jnp
 
 import envs
+from jaxpg.config.parsing import compose
 from jaxpg.normalization import RunningStatistics
-from jaxpg.run.config import compose
-from jaxpg.run.policies import stored_policy
-from jaxpg.run.program import make_networks
-from jaxpg.run.state import Policy
+from jaxpg.program.networks import make_networks
+from jaxpg.program.state import Policy
+from jaxpg.store.policies import stored_policy
 
 
 @functools.cache

@@ -3,8 +3,8 @@
 import jax
 import numpy as np
 
-from jaxpg.run.agents import agents_of, alone, setting_of
-from jaxpg.run.config import compose
+from jaxpg.config.parsing import compose
+from jaxpg.program.agents import agents_of, alone, setting_of
 
 SWEEP = ("seed=5", "num_seeds=3", "vmap_seeds=6", "sweep.algo.gamma=[0.5,0.75]", "sweep.network.sigma=[0.25,1]")
 

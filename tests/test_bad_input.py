@@ -10,8 +10,8 @@ import pytest
 from processes import tree
 
 from jaxpg import evaluate, train
-from jaxpg.run import cache
-from jaxpg.run.errors import run_command
+from jaxpg.commands.ending import run_command
+from jaxpg.store import cache
 
 MISTAKES = {
     "unknown option": (["lerning_rate=3"], "unknown option 'lerning_rate'"),

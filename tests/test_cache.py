@@ -9,9 +9,9 @@ import jax
 import jax.numpy as jnp
 import pytest
 
-from jaxpg.run import cache, stderr
-from jaxpg.run.cache import Store, cache_folder, compilation_cache, machine
-from jaxpg.run.checkpoint import Checkpoints
+from jaxpg.store import cache, stderr
+from jaxpg.store.cache import Store, cache_folder, compilation_cache, machine
+from jaxpg.store.checkpoint import Checkpoints
 
 hits = []  # jax has no public way to take a listener back: one for all tests
 jax.monitoring.register_event_listener(

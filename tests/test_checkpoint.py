@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxpg.run.checkpoint import CheckpointError, Checkpoints
+from jaxpg.store.checkpoint import CheckpointError, Checkpoints
 
 
 @pytest.mark.parametrize("impl", ["threefry2x32", "rbg"])

@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 from processes import has_written
 
-from jaxpg.run import policies
-from jaxpg.run.checkpoint import Checkpoints
+from jaxpg.store import policies
+from jaxpg.store.checkpoint import Checkpoints
 
 TINY = (
     "num_envs=4",

@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 
 from jaxpg import compare
-from jaxpg.run import config as configuration
-from jaxpg.run.config import compose
-from jaxpg.run.errors import UserError
-from jaxpg.run.statistics import bootstrap_interval, interquartile_mean, probability_of_improvement
+from jaxpg.config import configuration
+from jaxpg.config.parsing import compose
+from jaxpg.errors import UserError
+from jaxpg.store.statistics import bootstrap_interval, interquartile_mean, probability_of_improvement
 from jaxpg.watch import publication
 from jaxpg.watch.comparison import COLUMNS, comparison, notes, table
 from jaxpg.watch.methods import methods, standings

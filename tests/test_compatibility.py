@@ -6,9 +6,10 @@ import pytest
 from wrong_sums import wrong_sums
 
 from jaxpg.compatibility import WRONG_SUMS, check_jaxlib
-from jaxpg.run.agents import agents_of
-from jaxpg.run.config import compose
-from jaxpg.run.program import make_algorithm, make_env
+from jaxpg.config.parsing import compose
+from jaxpg.program.agents import agents_of
+from jaxpg.program.algorithms import make_algorithm
+from jaxpg.program.environment import make_env
 from jaxpg.training import train_scan
 
 

@@ -20,8 +20,8 @@ from envs.base import Interface, State, interface
 from envs.contract import conform
 from envs.options import OptionError
 from jaxpg import train
+from jaxpg.commands.ending import run_command
 from jaxpg.gymnasium_env import Single
-from jaxpg.run.errors import run_command
 
 
 def changed(**attributes):

@@ -5,8 +5,8 @@ import numpy as np
 import pytest
 from scipy.spatial import ConvexHull
 
-from jaxpg.run.attempts import NotDrawn
 from jaxpg.watch import drawing
+from jaxpg.watch.attempts import NotDrawn
 
 MESH = """<asset><mesh name="wedge" vertex="0 0 0  1 0 0  0 1 0  0 0 1  .1 .1 .1"/></asset>"""
 

@@ -12,11 +12,14 @@ import pytest
 from processes import outcome
 
 from jaxpg import train
-from jaxpg.run import program, session
+from jaxpg.config.parsing import compose
+from jaxpg.program import compile as program
+from jaxpg.program.algorithms import make_algorithm
+from jaxpg.program.compile import compile_program
+from jaxpg.program.environment import make_env
+from jaxpg.program.schedule import described_jump, plan
+from jaxpg.run import session
 from jaxpg.run.chunks import PATIENCE, Watch
-from jaxpg.run.config import compose
-from jaxpg.run.program import compile_program, make_algorithm, make_env
-from jaxpg.run.schedule import described_jump, plan
 from jaxpg.training import initial_state, train_chunk, train_scan
 from jaxpg.types import Algorithm, TrainState
 
@@ -324,7 +327,7 @@ def test_agents_that_stood_still_end_with_the_others(tmp_path, monkeypatch):
 
 
 def _updates_of_agents(folder):
-    from jaxpg.run.checkpoint import Checkpoints
+    from jaxpg.store.checkpoint import Checkpoints
 
     config = configured("num_seeds=2")
     shape = program.state_shape(make_algorithm(config, make_env(config)), 2)

@@ -16,10 +16,10 @@ from hypothesis import strategies as st
 
 from jaxpg import evaluate as command
 from jaxpg.evaluation import evaluate, play
-from jaxpg.run import closing
-from jaxpg.run.episodes import Results
-from jaxpg.run.state import Best, better
-from jaxpg.run.statistics import counted_returns
+from jaxpg.program.state import Best, better
+from jaxpg.store.statistics import counted_returns
+from jaxpg.watch import closing
+from jaxpg.watch.episodes import Results
 
 BOUND = 1e10
 LENGTH = 30

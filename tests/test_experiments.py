@@ -12,7 +12,7 @@ import jax
 import numpy as np
 import pytest
 
-from jaxpg.run.config import compose
+from jaxpg.config.parsing import compose
 
 EXPERIMENTS = Path(__file__).parent.parent / "experiments"
 PEERS = EXPERIMENTS / "peers"

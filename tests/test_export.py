@@ -13,14 +13,14 @@ from stored import a_policy
 
 from jaxpg import evaluate
 from jaxpg import export as command_line
+from jaxpg.config.parsing import compose
 from jaxpg.deploy import c, header, learning, onnx, reference, stablehlo
 from jaxpg.deploy.controller import commanding, controller, observations
 from jaxpg.deploy.export import FORMATS, TOLERANCE, trial
+from jaxpg.errors import UserError
 from jaxpg.features import FEATURES
 from jaxpg.networks import ACTIVATIONS
-from jaxpg.run.config import compose
-from jaxpg.run.errors import UserError
-from jaxpg.run.program import make_networks
+from jaxpg.program.networks import make_networks
 from jaxpg.types import Transition
 
 RELU = ("network.activation=relu",)
@@ -262,7 +262,7 @@ def test_what_commands_something_else_is_not_written(bug, monkeypatch, tmp_path)
     table, name, wrong = WRONG[bug]
     monkeypatch.setitem(table, name, wrong)
     stored = a_policy(*POLICIES["two commands"])
-    monkeypatch.setattr("jaxpg.run.policies.load", lambda *_: stored)
+    monkeypatch.setattr("jaxpg.store.policies.load", lambda *_: stored)
     monkeypatch.setattr("jaxpg.deploy.export.origin", lambda *_: {"policy": "drawn"})
     with pytest.raises(UserError, match=r"format=c: its commands differ from the formula's by .*; nothing is written"):
         command_line.main(["run=somewhere", f"out={tmp_path / 'out'}"])

@@ -17,10 +17,10 @@ from jaxpg import normalization
 from jaxpg.deploy import header, online, reference
 from jaxpg.deploy.controller import controller, observations, played
 from jaxpg.deploy.export import FORMATS, TOLERANCE, trial
+from jaxpg.errors import UserError
 from jaxpg.features import FEATURES
 from jaxpg.networks import ACTIVATIONS
 from jaxpg.normalization import RunningStatistics
-from jaxpg.run.errors import UserError
 
 # --- the reference: by loops over single numbers ----------------------------------------------------------------------
 
@@ -116,7 +116,7 @@ def export(monkeypatch, capsys, tmp_path):
     """`export(stored, *arguments)`: what the command says of the policy."""
 
     def run(stored, *arguments):
-        monkeypatch.setattr("jaxpg.run.policies.load", lambda *_: stored)
+        monkeypatch.setattr("jaxpg.store.policies.load", lambda *_: stored)
         monkeypatch.setattr("jaxpg.deploy.export.origin", lambda *_: {"policy": "drawn"})
         command_line.main(["run=somewhere", f"out={tmp_path / 'out'}", *arguments])
         return capsys.readouterr().out

@@ -17,7 +17,7 @@ from jaxpg.deploy import c
 from jaxpg.deploy.controller import controller
 from jaxpg.deploy.names import LONGEST, identifier
 from jaxpg.deploy.sealing import NO_SEAL, is_sealed, sealed
-from jaxpg.run.errors import UserError
+from jaxpg.errors import UserError
 
 OPTIONS = ("env=quadratic", "network.widths=[4]", "network=mlp")
 
@@ -26,7 +26,7 @@ OPTIONS = ("env=quadratic", "network.widths=[4]", "network=mlp")
 def export(monkeypatch):
     """`export(*arguments)`: the command, of a policy that is drawn."""
     stored = a_policy(*OPTIONS)
-    monkeypatch.setattr("jaxpg.run.policies.load", lambda *_: stored)
+    monkeypatch.setattr("jaxpg.store.policies.load", lambda *_: stored)
     monkeypatch.setattr("jaxpg.deploy.export.origin", lambda *_: {"policy": "drawn"})
     monkeypatch.setattr("jaxpg.deploy.controller.NUM_OBSERVATIONS", 200)
     return lambda *arguments: command_line.main(["run=somewhere", *arguments])

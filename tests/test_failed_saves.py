@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from processes import LINES, RUN, bound_by_permissions, mounted, outcome, output_until, proceed, stop_after, training
 
-from jaxpg.run.checkpoint import Checkpoints, SaveError
-from jaxpg.run.folder import RunFolder, read_metrics
-from jaxpg.run.metrics_log import MetricsLog
+from jaxpg.store.checkpoint import Checkpoints, SaveError
+from jaxpg.store.folder import RunFolder, read_metrics
+from jaxpg.store.metrics_log import MetricsLog
 
 SAVE_FAILED = "training goes on, and saving is tried again at each line of metrics"
 LOST = "could not be saved; resume="

@@ -7,7 +7,7 @@ import matplotlib.figure
 import numpy as np
 import pytest
 
-from jaxpg.run import figures
+from jaxpg.watch import figures
 from jaxpg.watch.page import PARTS
 
 LINES = [{"steps": step, "return": [1.0 * step, 2.0], "eval_return": [3.0, 4.0 * step]} for step in (1, 2, 3)]

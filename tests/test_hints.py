@@ -10,10 +10,9 @@ import pytest
 from envs import hints, playground_env
 from envs.options import OptionError
 from jaxpg.deploy.export import FORMATS
-from jaxpg.run import episodes
-from jaxpg.run.errors import UserError
-from jaxpg.run.loggers import follower
-from jaxpg.watch import movie
+from jaxpg.errors import UserError
+from jaxpg.store.loggers import follower
+from jaxpg.watch import episodes, movie
 
 
 @pytest.fixture

@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 
 from jaxpg.actor_critic import BASELINES, ESTIMATORS
-from jaxpg.run.config import compose
-from jaxpg.run.program import make_algorithm, make_env, make_method
+from jaxpg.config.parsing import compose
+from jaxpg.program.algorithms import make_algorithm, reinforce_method, td_method
+from jaxpg.program.environment import make_env
 from jaxpg.training import initial_state, train_scan
 from jaxpg.types import Transition
 
@@ -76,7 +77,8 @@ def advantages(*options):
     reward, value, next_value, squared_score = jnp.asarray(random.uniform(0.5, 2.0, (4, 8, 3)), jnp.float32)
     zero = jnp.zeros((8, 3))
     steps = Transition(zero, zero, reward, zero, zero.at[3, 0].set(1.0), zero, zero, zero, zero)
-    method = make_method(configured(*options))
+    config = configured(*options)
+    method = {"td": td_method, "reinforce": reinforce_method}[config.choices["algo"]](config)
     return np.asarray(method.estimate(steps, method.weight(steps), value, next_value, squared_score).advantage)
 
 

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from jaxpg.run.config import compose
+from jaxpg.config.parsing import compose
 
 ROOT = Path(__file__).parent.parent
 LESSON = (ROOT / "docs" / "lesson.md").read_text(encoding="utf-8")

@@ -13,11 +13,11 @@ from types import SimpleNamespace
 import pytest
 
 from jaxpg import train
-from jaxpg.run import folder
-from jaxpg.run.errors import UserError
-from jaxpg.run.folder import RunFolder
-from jaxpg.run.loggers import LoggerError, UntilItFails, follower, sender, values_of
-from jaxpg.run.metrics_log import MetricsLog
+from jaxpg.errors import UserError
+from jaxpg.store import folder
+from jaxpg.store.folder import RunFolder
+from jaxpg.store.loggers import LoggerError, UntilItFails, follower, sender, values_of
+from jaxpg.store.metrics_log import MetricsLog
 
 # A stand-in for wandb that writes down what it is given, in a process of its own as the real one.
 STAND_IN = """
@@ -280,6 +280,6 @@ def test_a_store_on_this_machine_needs_a_database(monkeypatch, uri):
 
 
 def test_the_process_of_a_logger_is_a_light_one():
-    code = "import sys, jaxpg.run.loggers.sender; print(*sys.modules)"
+    code = "import sys, jaxpg.store.loggers.sender; print(*sys.modules)"
     loaded = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout.split()
     assert not {"jax", "envs", "numpy", "wandb", "mlflow"} & set(loaded)

@@ -12,10 +12,10 @@ from pathlib import Path
 import pytest
 from processes import LINES, RUN, has_written, stop_after, training
 
-from jaxpg.run import folder
-from jaxpg.run.folder import RunFolder
-from jaxpg.run.loggers import follower, values_of
-from jaxpg.run.metrics_log import MetricsLog
+from jaxpg.store import folder
+from jaxpg.store.folder import RunFolder
+from jaxpg.store.loggers import follower, values_of
+from jaxpg.store.metrics_log import MetricsLog
 
 
 def installed():

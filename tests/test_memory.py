@@ -6,10 +6,11 @@ import jax
 import numpy as np
 import pytest
 
-from jaxpg.run import memory
-from jaxpg.run.config import compose
-from jaxpg.run.errors import UserError
-from jaxpg.run.program import make_algorithm, make_env
+from jaxpg.config.parsing import compose
+from jaxpg.errors import UserError
+from jaxpg.program import memory
+from jaxpg.program.algorithms import make_algorithm
+from jaxpg.program.environment import make_env
 from jaxpg.training import initial_state, train_scan
 
 SIZES = {

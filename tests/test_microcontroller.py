@@ -9,10 +9,10 @@ import pytest
 from microcontroller import CONTROLLER, CORES, LEARNER
 
 from envs.base import Interface
+from jaxpg.config.parsing import compose
 from jaxpg.deploy import c
 from jaxpg.deploy.controller import Controller, Layer, Learner
-from jaxpg.run.config import compose
-from jaxpg.run.errors import UserError
+from jaxpg.errors import UserError
 
 try:
     microcontroller.check_tools()

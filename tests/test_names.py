@@ -15,8 +15,8 @@ import envs
 from envs.base import Interface, initial_state
 from envs.options import option
 from jaxpg import evaluate, train
-from jaxpg.run import policies
-from jaxpg.run.names import OURS, numbered, own_interface, own_metrics
+from jaxpg.store import policies
+from jaxpg.store.names import OURS, numbered, own_interface, own_metrics
 from jaxpg.watch.clips import clip
 from jaxpg.watch.recording import record
 

@@ -17,16 +17,15 @@ import envs
 from envs.base import Interface, initial_state
 from envs.options import option
 from envs.scenes import PhasePlane, Scene
+from jaxpg.config.parsing import compose
+from jaxpg.errors import UserError
 from jaxpg.normalization import RunningStatistics
-from jaxpg.run import attempts
-from jaxpg.run.attempts import NotDrawn, attempt
-from jaxpg.run.config import compose
-from jaxpg.run.errors import UserError
-from jaxpg.run.folder import RunFolder
-from jaxpg.run.policies import stored_policy, untrained
-from jaxpg.run.program import make_networks
-from jaxpg.run.state import Policy
-from jaxpg.watch import player, report
+from jaxpg.program.networks import make_networks
+from jaxpg.program.state import Policy
+from jaxpg.store.folder import RunFolder
+from jaxpg.store.policies import stored_policy, untrained
+from jaxpg.watch import attempts, player, report
+from jaxpg.watch.attempts import NotDrawn, attempt
 from jaxpg.watch.page import page
 
 ROBOT = """<mujoco><worldbody>

@@ -12,8 +12,8 @@ import pytest
 from processes import LINES, RUN, outcome, stop_after, training, tree
 
 from jaxpg import train
-from jaxpg.run import lock
-from jaxpg.run.errors import UserError
+from jaxpg.errors import UserError
+from jaxpg.store import lock
 
 FIRST_CHECKPOINT = 10  # lines of metrics before it
 

@@ -12,8 +12,8 @@ from stored import a_policy
 import jaxpg
 from jaxpg.deploy import reference
 from jaxpg.deploy.controller import controller
-from jaxpg.run import policies
-from jaxpg.run.errors import UserError
+from jaxpg.errors import UserError
+from jaxpg.store import policies
 
 
 @pytest.fixture(scope="module")
@@ -32,7 +32,7 @@ def drawn(monkeypatch):
 
     def make(*options):
         stored = a_policy(*options)
-        monkeypatch.setattr("jaxpg.run.policies.load", lambda *_: stored)
+        monkeypatch.setattr("jaxpg.store.policies.load", lambda *_: stored)
         return stored, jaxpg.load("somewhere")
 
     return make

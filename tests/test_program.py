@@ -7,11 +7,14 @@ import numpy as np
 import pytest
 
 import envs
+from jaxpg.config.configuration import flatten
+from jaxpg.config.parsing import compose
 from jaxpg.learning import Reuse
-from jaxpg.run.config import compose, flatten
-from jaxpg.run.program import compile_program, make_algorithm, make_env, make_reuse
-from jaxpg.run.schedule import plan
-from jaxpg.run.state import current_policy
+from jaxpg.program.algorithms import make_algorithm, make_reuse
+from jaxpg.program.compile import compile_program
+from jaxpg.program.environment import make_env
+from jaxpg.program.schedule import plan
+from jaxpg.program.state import current_policy
 from jaxpg.training import train_scan
 
 SIZES = ("env=quadratic", "network=linear", "num_envs=4", "num_steps=5", "total_steps=400", "env.episode_length=8")
@@ -88,7 +91,6 @@ def test_other_parameters_learn_as_ever_while_sigma_is_scheduled():
 def test_reuse_is_what_the_options_say():
     options = ("algo.epochs=3", "algo.minibatches=2", "algo.clip=null", "algo.max_kl=0.1", "algo.value_clip=0.5")
     assert make_reuse(compose(["algo=ppo", *options])) == Reuse(3, 2, None, 0.5, 0.1)
-    assert make_reuse(compose(["algo=td"])) is None
 
 
 def trained(*options, chunks=2):

@@ -23,11 +23,12 @@ from envs.quadratic import (
     state_moments,
     values,
 )
+from jaxpg.config.parsing import compose
 from jaxpg.networks import linear_mean
+from jaxpg.program.algorithms import make_algorithm
+from jaxpg.program.environment import make_env
+from jaxpg.program.schedule import plan
 from jaxpg.rollout import rollout
-from jaxpg.run.config import compose
-from jaxpg.run.program import make_algorithm, make_env
-from jaxpg.run.schedule import plan
 from jaxpg.training import train_scan
 from jaxpg.vector_env import vectorize
 

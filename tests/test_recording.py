@@ -10,8 +10,10 @@ from envs.pendulum import observe
 from envs.scenes import scene
 from jaxpg import normalization
 from jaxpg.evaluation import evaluate
-from jaxpg.run.policies import untrained
-from jaxpg.run.program import initial_run, make_algorithm, make_networks
+from jaxpg.program.algorithms import make_algorithm
+from jaxpg.program.networks import make_networks
+from jaxpg.program.state import initial_run
+from jaxpg.store.policies import untrained
 from jaxpg.watch import drawing
 from jaxpg.watch.clips import clip
 from jaxpg.watch.player import in_plane

@@ -16,9 +16,10 @@ from processes import outcome, tree
 import envs
 from envs.options import OptionError, option
 from jaxpg import train
-from jaxpg.run import cache, config
-from jaxpg.run.config import compose
-from jaxpg.run.errors import run_command
+from jaxpg.commands.ending import run_command
+from jaxpg.config import configuration
+from jaxpg.config.parsing import compose
+from jaxpg.store import cache, config_file
 
 RUN = tuple(size for size in SIZES if not size.startswith("network"))
 
@@ -108,8 +109,8 @@ def test_options_of_every_kind_go_through_the_command_line_and_a_file(monkeypatc
     found = compose(["env=odd", "run_dir=runs/${x}", *given])
     assert found.env == Rich(start=(0.25, 1.0), gains=(7,), side="right", tries=2, pace=2.5, goals=[[1.0], []])
     assert found.run.run_dir == "runs/${x}"
-    (tmp_path / "config.yaml").write_text(config.to_yaml(found), encoding="utf-8")
-    assert config.load(tmp_path / "config.yaml") == found
+    (tmp_path / "config.yaml").write_text(configuration.to_yaml(found), encoding="utf-8")
+    assert config_file.load(tmp_path / "config.yaml") == found
 
 
 @pytest.mark.parametrize(
@@ -215,7 +216,9 @@ def test_without_training_values_the_defaults_apply_and_it_is_said(monkeypatch, 
     status, output = trained(monkeypatch, capsys, tmp_path / "run", "env=odd")
     assert status == 0
     assert "env=odd has no training values for algo=td: the defaults apply" in output
-    assert " ".join(config.load(tmp_path / "run" / "config.yaml").to_dict()["env"]) == "id speed gains episode_length"
+    assert (
+        " ".join(config_file.load(tmp_path / "run" / "config.yaml").to_dict()["env"]) == "id speed gains episode_length"
+    )
 
 
 def test_trainings_in_threads(monkeypatch, tmp_path):

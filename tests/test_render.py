@@ -19,7 +19,7 @@ from stored import a_policy
 from envs.options import OptionError
 from envs.scenes import scene
 from jaxpg import render as command_line
-from jaxpg.run.errors import UserError
+from jaxpg.errors import UserError
 from jaxpg.watch import gl, movie, video
 from jaxpg.watch.clips import Clip
 from jaxpg.watch.recording import Look
@@ -337,7 +337,7 @@ def run(monkeypatch, tmp_path):
     folder.mkdir()
     (folder / "config.yaml").touch()
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
-    monkeypatch.setattr("jaxpg.run.policies.load", lambda *_: a_policy(*PENDULUM))
+    monkeypatch.setattr("jaxpg.store.policies.load", lambda *_: a_policy(*PENDULUM))
     return folder
 
 
@@ -381,7 +381,7 @@ def test_mistakes_are_one_line(arguments, message, run, monkeypatch):
 
 def test_what_has_no_body_is_not_drawn(run, monkeypatch):
     monkeypatch.setattr(gl, "works", lambda name: True)
-    monkeypatch.setattr("jaxpg.run.policies.load", lambda *_: a_policy("env=quadratic", "network=linear"))
+    monkeypatch.setattr("jaxpg.store.policies.load", lambda *_: a_policy("env=quadratic", "network=linear"))
     with pytest.raises(UserError, match="env=quadratic is no robot: there is nothing to be seen of it"):
         command_line.main([f"run={run}", f"out={run / 'v.gif'}"])
 

@@ -5,8 +5,8 @@ import shlex
 
 import pytest
 
-from jaxpg.run import repeat
-from jaxpg.run.config import compose, parse
+from jaxpg.config import repeat
+from jaxpg.config.parsing import compose, parse
 
 
 @pytest.mark.parametrize(

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from jaxpg import report as command_line
-from jaxpg.run.folder import RunFolder, read_metrics
+from jaxpg.store.folder import RunFolder, read_metrics
 from jaxpg.watch.curves import curve, finite, numbers
 from jaxpg.watch.player import packed
 

@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 
-from jaxpg.run.config import compose
-from jaxpg.run.figures import sweep_curves
-from jaxpg.run.results import DRAWN, SHOWN, best_returns, curves, heading, ranking, table
-from jaxpg.run.statistics import bootstrap_interval, interquartile_mean
+from jaxpg.config.parsing import compose
+from jaxpg.store.results import DRAWN, SHOWN, best_returns, curves, heading, ranking, table
+from jaxpg.store.statistics import bootstrap_interval, interquartile_mean
+from jaxpg.watch.figures import sweep_curves
 
 CONFIG = compose(["num_seeds=4", "sweep.algo.gamma=[0.5,0.75,1]"])
 FIRST = [1.0, 2.0, 3.0, None, 7.0, 5.0, 6.0, 8.0, 0.0, 0.0, 0.0, 0.0]

@@ -16,10 +16,10 @@ from in_process import contents, ended
 from processes import RUN, bound_by_permissions, outcome, proceed, stop_after, training, tree
 
 from jaxpg import compare, evaluate, export, inspect, report, train
-from jaxpg.run import cache, files, folder, lines, lock, versions
-from jaxpg.run.checkpoint import CheckpointError, Checkpoints, SaveError
-from jaxpg.run.errors import UserError
-from jaxpg.run.folder import RunFolder, read_metrics
+from jaxpg.errors import UserError
+from jaxpg.store import cache, files, folder, lines, lock, versions
+from jaxpg.store.checkpoint import CheckpointError, Checkpoints, SaveError
+from jaxpg.store.folder import RunFolder, read_metrics
 
 SIZES = ("env=quadratic", "network=linear", "num_envs=2", "num_steps=4", "log_interval=16", "eval_interval=32")
 TINY = (*SIZES, "eval_episodes=2", "env.episode_length=8", "checkpoint_interval=32", "report=false", "total_steps=96")

@@ -11,10 +11,10 @@ import time
 
 import pytest
 
-from jaxpg.run import folder
-from jaxpg.run.config import compose
-from jaxpg.run.errors import run_command
+from jaxpg.commands.ending import run_command
+from jaxpg.config.parsing import compose
 from jaxpg.run.signals import Interrupts, StopRequests
+from jaxpg.store import folder
 
 
 def interrupt():
@@ -120,7 +120,7 @@ COMPILING = """
 import jax, threading, time
 from concurrent.futures import ThreadPoolExecutor
 from jaxpg.run import program
-from jaxpg.run.errors import run_command
+from jaxpg.errors import run_command
 
 def main(arguments):
     with program._compilers() as pool:

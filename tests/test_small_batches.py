@@ -11,10 +11,11 @@ import envs
 from envs.base import initial_state
 from envs.options import OptionError, option
 from jaxpg.actor_critic import BASELINES
+from jaxpg.config.conflicts import OF_OTHER_EPISODES
+from jaxpg.config.parsing import compose
 from jaxpg.estimators import normalize_advantages
-from jaxpg.run.config import compose
-from jaxpg.run.conflicts import OF_OTHER_EPISODES
-from jaxpg.run.program import make_algorithm, make_env
+from jaxpg.program.algorithms import make_algorithm
+from jaxpg.program.environment import make_env
 from jaxpg.training import train_scan
 
 BEST = 0.5

@@ -10,10 +10,11 @@ import pytest
 from processes import LINES, RUN, outcome
 
 from envs.base import State
+from jaxpg.config.parsing import compose
+from jaxpg.program.algorithms import make_algorithm
+from jaxpg.program.environment import make_env
 from jaxpg.rollout import rollout
 from jaxpg.run.chunks import Watch, summary
-from jaxpg.run.config import compose
-from jaxpg.run.program import make_algorithm, make_env
 from jaxpg.soundness import quantities, sound
 from jaxpg.training import train_scan
 from jaxpg.types import Algorithm, TrainState
@@ -179,7 +180,7 @@ def test_a_reset_that_is_not_finite_is_an_observation():
             return state.replace(obs=state.obs + jnp.nan)
 
     config = compose(["env=quadratic", "algo=td", "network=linear", "num_envs=4", "num_steps=2"])
-    from jaxpg.run import program
+    from jaxpg.program import compile as program
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(program, "vectorize", lambda env, *sizes: vectorize(Born("obs", 0.0), *sizes))

@@ -7,7 +7,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from jaxpg.run.statistics import (
+from jaxpg.store.statistics import (
     bootstrap_interval,
     fewest_seeds,
     improvement_interval,

@@ -13,8 +13,8 @@ import envs
 from envs.physics import step
 from envs.physics.interpreter import trace
 from envs.physics.storage import from_text, kept_in, name_of, to_text
-from jaxpg.run import cache
-from jaxpg.run.cache import Texts, cache_folder, physics_cache, remove_old
+from jaxpg.store import cache
+from jaxpg.store.cache import Texts, cache_folder, physics_cache, remove_old
 
 MODEL = envs.REGISTRY["pendulum"].build().model
 ENDS = ("qpos", "qvel", "ctrl"), ("qpos", "qvel")
@@ -105,9 +105,9 @@ def test_another_process_finds_it_and_imports_no_mjx(folder):
     """The commands' processes: which of them import MJX is what half of their start-up was."""
     code = """
 import sys
-from jaxpg.run.cache import physics_cache
-from jaxpg.run.config import compose
-from jaxpg.run.program import make_env
+from jaxpg.store.cache import physics_cache
+from jaxpg.config.parsing import compose
+from jaxpg.program.environment import make_env
 with physics_cache(True):
     make_env(compose(["env=pendulum"]))
 print("mujoco.mjx" in sys.modules)

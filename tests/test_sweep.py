@@ -4,11 +4,14 @@ import jax
 import numpy as np
 import pytest
 
-from jaxpg.run.agents import crossed, with_values
-from jaxpg.run.config import compose, from_dict
-from jaxpg.run.program import make_algorithm, make_env, over_agents
-from jaxpg.run.schema import GROUPS
-from jaxpg.run.sweep import settings, sweepable
+from jaxpg.config.configuration import from_dict
+from jaxpg.config.parsing import compose
+from jaxpg.config.schema import GROUPS
+from jaxpg.config.sweep import settings, sweepable
+from jaxpg.program.agents import crossed, with_values
+from jaxpg.program.algorithms import make_algorithm
+from jaxpg.program.environment import make_env
+from jaxpg.program.mapping import over_agents
 from jaxpg.training import train_scan
 
 SIZES = ("env=quadratic", "num_envs=4", "total_steps=400", "env.episode_length=8")

@@ -10,8 +10,9 @@ import time
 import pytest
 from rich.console import Console
 
-from jaxpg.run import cache, stderr, terminal
-from jaxpg.run.stderr import filtered
+from jaxpg.run import terminal
+from jaxpg.store import cache, stderr
+from jaxpg.store.stderr import filtered
 
 LINE = {"update": 2, "steps": 50, "return": -3.0, "eval_return": -2.5, "seconds": 1.0}
 
@@ -120,7 +121,7 @@ def test_the_last_words_of_a_process_that_aborts_are_passed_on():
     """All of them: a thread of the process itself would die with some unread."""
     words = b"what was wrong\n" * 4000  # of 15 letters: less than a pipe holds
     program = (
-        "import os\nfrom jaxpg.run.stderr import filtered\n"
+        "import os\nfrom jaxpg.store.stderr import filtered\n"
         "with filtered():\n"
         "    os.write(2, b'what was wrong\\n' * 4000)\n"
         "    os.abort()\n"

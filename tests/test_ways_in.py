@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from jaxpg.__main__ import VERBS
-from jaxpg.run import versions
+from jaxpg.store import versions
 
 ROOT = Path(__file__).parent.parent
 

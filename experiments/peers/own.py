@@ -17,12 +17,14 @@ import jax  # noqa: E402
 
 sys.path.insert(0, str(Path(__file__).parents[2]))  # the repository, if it is not installed
 from jaxpg.actor_critic import deterministic_policy  # noqa: E402
-from jaxpg.run.cache import compilation_cache, physics_cache  # noqa: E402
-from jaxpg.run.config import compose  # noqa: E402
-from jaxpg.run.program import compile_program, make_env, make_networks  # noqa: E402
-from jaxpg.run.runtime import prepare  # noqa: E402
-from jaxpg.run.schedule import plan  # noqa: E402
-from jaxpg.run.state import current_policy  # noqa: E402
+from jaxpg.config.parsing import compose  # noqa: E402
+from jaxpg.program.backend import prepare  # noqa: E402
+from jaxpg.program.compile import compile_program  # noqa: E402
+from jaxpg.program.environment import make_env  # noqa: E402
+from jaxpg.program.networks import make_networks  # noqa: E402
+from jaxpg.program.schedule import plan  # noqa: E402
+from jaxpg.program.state import current_policy  # noqa: E402
+from jaxpg.store.cache import compilation_cache, physics_cache  # noqa: E402
 
 
 def main() -> None:

@@ -14,7 +14,7 @@ from jaxpg.deploy import online
 from jaxpg.deploy.controller import Controller
 from jaxpg.deploy.header import header, named
 from jaxpg.deploy.sealing import NO_SEAL, sealed
-from jaxpg.run.errors import UserError
+from jaxpg.errors import UserError
 
 FLAGS = ("-std=c99", "-O2", "-Wall", "-Wextra", "-Wpedantic", "-Werror")
 

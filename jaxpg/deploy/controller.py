@@ -21,12 +21,12 @@ import numpy as np
 
 from envs.base import Interface
 from jaxpg import normalization
+from jaxpg.config.schema import Linear, Online
 from jaxpg.deploy.names import identifier, printable
+from jaxpg.errors import UserError
 from jaxpg.evaluation import play
-from jaxpg.run.errors import UserError
-from jaxpg.run.policies import StoredPolicy
-from jaxpg.run.schema import Online
-from jaxpg.run.state import Policy
+from jaxpg.program.state import Policy
+from jaxpg.store.policies import StoredPolicy
 
 FARTHEST = 1e6  # deviations from training's mean: beyond, an observation is not valid
 NUM_OBSERVATIONS = 10_000  # on which a controller is tried
@@ -47,7 +47,7 @@ class Learner(NamedTuple):
     Attributes:
       value: the critic's layer.
       log_std: log sigma, `[m]`.
-      options: those of the algorithm, `jaxpg.run.schema.Online`.
+      options: those of the algorithm, `jaxpg.config.schema.Online`.
       learns_sigma: whether sigma is one of the policy's parameters.
     """
 
@@ -116,7 +116,7 @@ def controller(stored: StoredPolicy, origin: dict[str, str], name: str | None = 
         features=network.features,
         order=network.order,
         layers=[Layer(np.asarray(layer["kernel"]), np.asarray(layer["bias"])) for layer in layers],
-        activation=getattr(network, "activation", "tanh"),
+        activation=network.activation,
         squash=network.squash,
         origin={key: printable(text) for key, text in origin.items()},
         learner=_learner(stored),
@@ -157,8 +157,8 @@ def _check_numbers(made: Controller) -> None:
 def _learner(stored: StoredPolicy) -> Learner | None:
     config, params = stored.config, stored.policy.params
     learns_sigma = config.network.sigma_is == "learned"
-    linear = config.choices["network"] == "linear" and config.network.sigma_is in ("fixed", "learned")
-    if config.choices["algo"] != "online" or not linear:
+    linear = isinstance(config.network, Linear) and config.network.sigma_is in ("fixed", "learned")
+    if not isinstance(config.algo, Online) or not linear:
         return None
     value = params["critic"]["params"]["Dense_0"]
     size = params["actor"]["params"]["MLP_0"]["Dense_0"]["bias"].shape

@@ -14,16 +14,16 @@ import jax
 import numpy as np
 
 from envs.hints import pip_install
+from jaxpg.config.schema import ExportOptions
 from jaxpg.deploy import c, learning, onnx, reference, sealing, stablehlo
 from jaxpg.deploy.controller import Controller, commanding, controller, drawn, played
-from jaxpg.run import folder, policies
-from jaxpg.run.agents import described
-from jaxpg.run.cache import physics_cache
-from jaxpg.run.checkpoint import Checkpoints
-from jaxpg.run.errors import UserError
-from jaxpg.run.policies import StoredPolicy
-from jaxpg.run.program import make_networks
-from jaxpg.run.schema import ExportOptions
+from jaxpg.errors import UserError
+from jaxpg.program.agents import described
+from jaxpg.program.networks import make_networks
+from jaxpg.store import folder, policies
+from jaxpg.store.cache import physics_cache
+from jaxpg.store.checkpoint import Checkpoints
+from jaxpg.store.policies import StoredPolicy
 
 TOLERANCE = 1e-5  # of the limit
 STEEP = 16  # an error may be so many times what float arithmetic itself costs a network

@@ -10,13 +10,13 @@ import numpy as np
 
 from jaxpg import divergence
 from jaxpg.actor_critic import sampling_policy
+from jaxpg.config.schema import Online
 from jaxpg.networks import Networks, linear_mean
 from jaxpg.online import Traces, learnable, trace_update
+from jaxpg.program.networks import make_networks
+from jaxpg.program.state import Policy
 from jaxpg.rollout import rollout
-from jaxpg.run.policies import StoredPolicy
-from jaxpg.run.program import make_networks
-from jaxpg.run.schema import Online
-from jaxpg.run.state import Policy
+from jaxpg.store.policies import StoredPolicy
 from jaxpg.types import PyTree, Transition
 from jaxpg.vector_env import vectorize
 

@@ -12,10 +12,10 @@ import numpy as np
 
 from envs.base import Interface
 from jaxpg.deploy.controller import command_fn
-from jaxpg.run import policies
-from jaxpg.run.cache import physics_cache
-from jaxpg.run.errors import UserError
-from jaxpg.run.state import Policy as Parameters
+from jaxpg.errors import UserError
+from jaxpg.program.state import Policy as Parameters
+from jaxpg.store import policies
+from jaxpg.store.cache import physics_cache
 
 CHECKPOINTS = ("best", "last")
 

@@ -15,8 +15,8 @@ import tempfile
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
-from jaxpg.run.errors import UserError
-from jaxpg.run.files import opened, read, through
+from jaxpg.errors import UserError
+from jaxpg.store.files import opened, read, through
 
 NO_SEAL = "jaxpg:" + 16 * "0"
 SEAL = re.compile(rb"jaxpg:[0-9a-f]{16}")

@@ -7,11 +7,11 @@ from typing import Any
 
 import numpy as np
 
+from jaxpg.config.configuration import Config
 from jaxpg.divergence import BOUND
-from jaxpg.run.agents import described_agent
-from jaxpg.run.config import Config
-from jaxpg.run.folder import jsonable
+from jaxpg.program.agents import described_agent
 from jaxpg.soundness import FLAGS, quantities
+from jaxpg.store.folder import jsonable
 from jaxpg.types import Metrics, TrainState
 
 NO_MEASUREMENTS = (*FLAGS, "diverged_env")

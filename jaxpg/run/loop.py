@@ -8,20 +8,20 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
+from jaxpg.config.configuration import Config
+from jaxpg.config.schema import Run
+from jaxpg.program.compile import Program
+from jaxpg.program.schedule import Schedule
+from jaxpg.program.state import Best, RunState, better, current_policy
 from jaxpg.run.chunks import PATIENCE, Watch, summary
-from jaxpg.run.config import Config
-from jaxpg.run.folder import RunFolder, jsonable
-from jaxpg.run.keeper import Keeper
-from jaxpg.run.metrics_log import MetricsLog
-from jaxpg.run.names import own_metrics
-from jaxpg.run.program import Program
-from jaxpg.run.schedule import Schedule
-from jaxpg.run.schema import Run
 from jaxpg.run.signals import StopRequests
-from jaxpg.run.state import Best, RunState, better, current_policy
-from jaxpg.run.statistics import counted_returns, finite_mean
 from jaxpg.run.terminal import Display
 from jaxpg.run.watchdog import Watchdog
+from jaxpg.store.folder import RunFolder, jsonable
+from jaxpg.store.keeper import Keeper
+from jaxpg.store.metrics_log import MetricsLog
+from jaxpg.store.names import own_metrics
+from jaxpg.store.statistics import counted_returns, finite_mean
 from jaxpg.types import Metrics, TrainState
 
 

@@ -7,41 +7,60 @@ import importlib
 import time
 from collections.abc import Callable, Mapping
 from signal import Signals
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from envs.base import interface
+from jaxpg.config import configuration
+from jaxpg.config.configuration import Config
 from jaxpg.divergence import BOUND
-from jaxpg.run import agents, folder, lock, memory, results, same_run, versions
-from jaxpg.run import config as configuration
-from jaxpg.run.cache import compilation_cache, physics_cache, timed
-from jaxpg.run.closing import draw_learning_curve, show_results
-from jaxpg.run.config import Config
-from jaxpg.run.errors import UserError
-from jaxpg.run.folder import RunFolder
-from jaxpg.run.lines import up_to
-from jaxpg.run.loggers import follower
+from jaxpg.errors import UserError
+from jaxpg.program import agents, memory
+from jaxpg.program.backend import prepare
+from jaxpg.program.compile import Program, compile_program
+from jaxpg.program.environment import make_env
+from jaxpg.program.schedule import described_jump, plan
+from jaxpg.program.state import RunState
 from jaxpg.run.loop import Loop, Session, is_solved, updates_made
-from jaxpg.run.program import Program, compile_program, make_env
-from jaxpg.run.runtime import prepare
-from jaxpg.run.schedule import described_jump, plan
 from jaxpg.run.signals import StopRequests
-from jaxpg.run.state import RunState
 from jaxpg.run.terminal import Display
+from jaxpg.store import config_file, folder, lock, results, same_run, versions
+from jaxpg.store.cache import compilation_cache, physics_cache, timed
+from jaxpg.store.folder import RunFolder
+from jaxpg.store.lines import up_to
+from jaxpg.store.loggers import follower
 from jaxpg.types import TrainState
 
 # Slow to import and not needed before training: imported while XLA compiles.
-NEEDED_LATER = ("jaxpg.run.checkpoint", "tensorboardX", "matplotlib.figure", "matplotlib.backends.backend_agg")
+NEEDED_LATER = ("jaxpg.store.checkpoint", "tensorboardX", "matplotlib.figure", "matplotlib.backends.backend_agg")
 EXPLODED = 4  # the exit status of a run that ended because its numbers were not finite
 NOT_SAVED = 5  # the exit status of a run whose last state is on no disk
 
 
-def begin(config: Config, check: Callable[[RunFolder], None] = folder.check_empty) -> int:
+class Times(NamedTuple):
+    """What a training took.
+
+    Attributes:
+      rate: environment steps per second, of all agents.
+      compiling, training: seconds.
+    """
+
+    rate: float
+    compiling: float
+    training: float
+
+
+# What is done with a run that has ended well, while its folder is still owned; without times it had ended before.
+Finish = Callable[[Session, Times | None], None]
+
+
+def begin(config: Config, finish: Finish, check: Callable[[RunFolder], None] = folder.check_empty) -> int:
     """Trains from the beginning; returns the exit status.
 
     Args:
       config: of the run.
+      finish: called with a run that has ended with status 0.
       check: raises UserError where the folder holds what must not be overwritten.
     """
     prepare(config)
@@ -52,10 +71,10 @@ def begin(config: Config, check: Callable[[RunFolder], None] = folder.check_empt
     check(run_folder)
     with folder.owned(run_folder, print):
         check(run_folder)  # another process may have been there just now
-        return _begin(config, env, run_folder)
+        return _begin(config, finish, env, run_folder)
 
 
-def _begin(config: Config, env: Any, run_folder: RunFolder) -> int:
+def _begin(config: Config, finish: Finish, env: Any, run_folder: RunFolder) -> int:
     schedule, run = plan(config), config.run
     folder.write_versions(run_folder)
     folder.replace(run_folder.config, configuration.to_yaml(config))
@@ -68,7 +87,7 @@ def _begin(config: Config, env: Any, run_folder: RunFolder) -> int:
     program, seconds = _compile(session, env)
     state = program.init()
     _check_start(np.asarray(state.train.env_state.obs), env)
-    return _train(session, program, state, seconds)
+    return _train(session, finish, program, state, seconds)
 
 
 def _check_start(obs: np.ndarray, env: Any) -> None:
@@ -85,18 +104,18 @@ def _check_start(obs: np.ndarray, env: Any) -> None:
         )
 
 
-def resume(given: Mapping[str, Any]) -> int:
+def resume(given: Mapping[str, Any], finish: Finish) -> int:
     """Goes on from the newest checkpoint of the run in `given["resume"]`; returns the exit status."""
     changes = {name: value for name, value in given.items() if name != "resume"}
     run_folder = folder.find(str(given["resume"]))
     with folder.owned(run_folder, print):
-        stored = configuration.load(run_folder.config)
+        stored = config_file.load(run_folder.config)
         config = configuration.change(stored, changes)
         same_run.check_options(run_folder, stored, config)
-        return _go_on(stored, config, run_folder)
+        return _go_on(stored, config, finish, run_folder)
 
 
-def begin_or_resume(config: Config) -> int:
+def begin_or_resume(config: Config, finish: Finish) -> int:
     """Goes on with the run in `run_dir` where there is something to resume, and else begins it; the exit status.
 
     Args:
@@ -106,17 +125,17 @@ def begin_or_resume(config: Config) -> int:
         raise UserError("resume=auto needs run_dir=DIR: the folder to begin in, or to resume from")
     run_folder = folder.planned(config)
     if not folder.has_checkpoints(run_folder):
-        return begin(config, folder.check_nothing_to_lose)
+        return begin(config, finish, folder.check_nothing_to_lose)
     with folder.owned(run_folder, print):
-        stored = configuration.load(run_folder.config)
+        stored = config_file.load(run_folder.config)
         # The folder may have been moved, or be given in other words.
         config = dataclasses.replace(config, run=dataclasses.replace(config.run, run_dir=stored.run.run_dir))
         same_run.check_options(run_folder, stored, config)
-        return _go_on(stored, config, run_folder)
+        return _go_on(stored, config, finish, run_folder)
 
 
-def _go_on(stored: Config, config: Config, run_folder: RunFolder) -> int:
-    from jaxpg.run.checkpoint import Checkpoints
+def _go_on(stored: Config, config: Config, finish: Finish, run_folder: RunFolder) -> int:
+    from jaxpg.store.checkpoint import Checkpoints
 
     recorded = folder.read_versions(run_folder)
     follower.check(config.run.loggers)
@@ -134,6 +153,7 @@ def _go_on(stored: Config, config: Config, run_folder: RunFolder) -> int:
         display.say(f"note: {problem}; the one before it is used")
     session = Session(config, schedule, run_folder, display)
     if _is_over(session, update):
+        finish(session, None)
         return 0
     now = versions.versions()
     changed = versions.changes(recorded, now)
@@ -145,14 +165,13 @@ def _go_on(stored: Config, config: Config, run_folder: RunFolder) -> int:
     folder.replace(run_folder.config, configuration.to_yaml(config))
     if changed:
         folder.change_versions(run_folder, recorded, now)
-    return _train(session, program, state, seconds)
+    return _train(session, finish, program, state, seconds)
 
 
 def _is_over(session: Session, update: int) -> bool:
     """Whether nothing is left to do after `update` updates, which is said then."""
     config, schedule, run_folder, display = session
     if update >= schedule.num_updates:
-        draw_learning_curve(session)
         display.say(f"{run_folder.path} is finished; a larger total_steps goes on")
         return True
     lines = up_to(folder.read_metrics(run_folder, config.num_agents), update)
@@ -202,7 +221,7 @@ def _import_the_rest() -> None:
         importlib.import_module(name)
 
 
-def _train(session: Session, program: Program, state: RunState, compile_seconds: float) -> int:
+def _train(session: Session, finish: Finish, program: Program, state: RunState, compile_seconds: float) -> int:
     """Until the last update or a request to stop; returns the exit status."""
     loop = Loop(session, program, state)
     try:
@@ -216,7 +235,7 @@ def _train(session: Session, program: Program, state: RunState, compile_seconds:
     if status:
         return status
     steps = (loop.update - loop.first) * session.schedule.steps_per_update * session.config.num_agents
-    show_results(session, steps / seconds, compile_seconds, seconds)
+    finish(session, Times(steps / seconds, compile_seconds, seconds))
     return 0
 
 

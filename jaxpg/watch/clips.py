@@ -8,8 +8,8 @@ from typing import NamedTuple
 import jax
 import numpy as np
 
-from jaxpg.run.names import SHOWN_BESIDE_COMMANDS
-from jaxpg.run.policies import StoredPolicy
+from jaxpg.store.names import SHOWN_BESIDE_COMMANDS
+from jaxpg.store.policies import StoredPolicy
 from jaxpg.watch.recording import Look, Recording
 
 STEPS = SHOWN_BESIDE_COMMANDS  # series of every episode

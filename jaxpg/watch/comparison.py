@@ -6,9 +6,9 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
-from jaxpg.run import folder, results
-from jaxpg.run.errors import UserError
-from jaxpg.run.statistics import (
+from jaxpg.errors import UserError
+from jaxpg.store import folder, results
+from jaxpg.store.statistics import (
     fewest_seeds,
     has_interval,
     improvement_interval,

@@ -8,9 +8,10 @@ from typing import Any
 
 import numpy as np
 
-from jaxpg.run import figures, results
-from jaxpg.run.config import Config
-from jaxpg.run.statistics import interquartile_mean, spread, spread_name
+from jaxpg.config.configuration import Config
+from jaxpg.store import results
+from jaxpg.store.statistics import interquartile_mean, spread, spread_name
+from jaxpg.watch import figures
 
 Json = dict[str, Any]
 PANELS = {"eval_return": "return", "eval_success": "success rate"}  # metric -> title

@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 import mujoco
 import numpy as np
 
-from jaxpg.run.attempts import NotDrawn
+from jaxpg.watch.attempts import NotDrawn
 
 SIDE = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])  # of models without a camera
 FAR = 4.0  # a robot that travels this many times its own size is followed

@@ -14,7 +14,7 @@ import sys
 from collections.abc import Callable, Mapping
 from typing import Any
 
-from jaxpg.run.errors import UserError
+from jaxpg.errors import UserError
 
 HEADLESS = ("egl", "osmesa")  # tried in this order
 INSTALL = {"egl": "apt-get install libegl1 libgl1-mesa-dri", "osmesa": "apt-get install libosmesa6"}

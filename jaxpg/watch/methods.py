@@ -11,11 +11,11 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from jaxpg.run import config as configuration
-from jaxpg.run import folder
-from jaxpg.run.agents import alone
-from jaxpg.run.errors import UserError
-from jaxpg.run.statistics import interquartile_mean
+from jaxpg.config import configuration
+from jaxpg.errors import UserError
+from jaxpg.program.agents import alone
+from jaxpg.store import config_file, folder
+from jaxpg.store.statistics import interquartile_mean
 from jaxpg.watch.curves import PANELS
 
 # What does not make another method: how much is looked at, written and waited for, and who draws the numbers.
@@ -138,7 +138,7 @@ def task(agent: Agent) -> str:
 
 def _agents(path: str) -> Iterator[Agent]:
     run_folder = folder.find(path)
-    config = configuration.load(run_folder.config)
+    config = config_file.load(run_folder.config)
     lines = folder.read_metrics(run_folder, config.num_agents)
     for i in range(config.num_agents):
         own = alone(config, i)

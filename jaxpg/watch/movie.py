@@ -19,8 +19,8 @@ from typing import NamedTuple
 import numpy as np
 
 from envs.hints import pip_install
-from jaxpg.run.errors import UserError
-from jaxpg.run.folder import replace
+from jaxpg.errors import UserError
+from jaxpg.store.folder import replace
 
 TICK = Fraction(1, 100)  # of a GIF's clock [s]
 SHORTEST = 2  # ticks of a picture: what says 1 is shown slowly by browsers

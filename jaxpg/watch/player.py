@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 
 from envs.scenes import PhasePlane, Scene
-from jaxpg.run.attempts import NotDrawn, attempt
-from jaxpg.run.policies import StoredPolicy
+from jaxpg.store.policies import StoredPolicy
 from jaxpg.watch import drawing
+from jaxpg.watch.attempts import NotDrawn, attempt
 from jaxpg.watch.clips import Clip, clip, command_names, limits_of
 from jaxpg.watch.curves import numbers
 from jaxpg.watch.recording import Recording, value_map

@@ -9,9 +9,9 @@ from typing import Any
 
 import numpy as np
 
-from jaxpg.run.figures import COLORS
-from jaxpg.run.statistics import has_interval, interquartile_mean, spread, spread_name
+from jaxpg.store.statistics import has_interval, interquartile_mean, spread, spread_name
 from jaxpg.watch.curves import PANELS
+from jaxpg.watch.figures import COLORS
 from jaxpg.watch.methods import Method, standings
 
 WIDTH, HEIGHT = 3.4, 2.6  # of a panel [inch]: one column of a paper

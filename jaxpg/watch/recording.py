@@ -12,9 +12,9 @@ import numpy as np
 
 from jaxpg.deploy.controller import physical
 from jaxpg.evaluation import play
-from jaxpg.run.policies import StoredPolicy
-from jaxpg.run.program import RUN_ONCE
-from jaxpg.run.state import Policy
+from jaxpg.program.backend import RUN_ONCE
+from jaxpg.program.state import Policy
+from jaxpg.store.policies import StoredPolicy
 from jaxpg.types import Metrics
 from jaxpg.watch.seen import Seen, seen
 

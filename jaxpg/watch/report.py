@@ -10,16 +10,17 @@ import jax
 import numpy as np
 
 from envs.scenes import references
-from jaxpg.run import agents, folder, policies, repeat, results
-from jaxpg.run import config as configuration
-from jaxpg.run.attempts import attempt
-from jaxpg.run.cache import compilation_cache, physics_cache
-from jaxpg.run.config import Config
-from jaxpg.run.folder import RunFolder
-from jaxpg.run.policies import StoredPolicy
-from jaxpg.run.program import SELECTION_SEED
-from jaxpg.run.statistics import counted_returns
+from jaxpg.config import configuration, repeat
+from jaxpg.config.configuration import Config
+from jaxpg.program import agents
+from jaxpg.program.compile import SELECTION_SEED
 from jaxpg.run.terminal import shown
+from jaxpg.store import config_file, folder, policies, results
+from jaxpg.store.cache import compilation_cache, physics_cache
+from jaxpg.store.folder import RunFolder
+from jaxpg.store.policies import StoredPolicy
+from jaxpg.store.statistics import counted_returns
+from jaxpg.watch.attempts import attempt
 from jaxpg.watch.clips import limits_of
 from jaxpg.watch.curves import curves, diagnostics, finite
 from jaxpg.watch.page import page
@@ -59,7 +60,7 @@ def of_run(path: str, agent: int | None, cache: bool, say: Callable[[str], None]
             stages["best"] = best
         if last.update != best.update or not best.evaluated:
             stages["last"] = last
-        data = report(run_folder, configuration.load(run_folder.config), stages)
+        data = report(run_folder, config_file.load(run_folder.config), stages)
     content = page(data)
     folder.replace(run_folder.report, content)
     for line in data["notes"]:

@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import jax
 
 from envs.scenes import PhasePlane, Scene, scene
-from jaxpg.run.attempts import NotDrawn, attempt, described
+from jaxpg.watch.attempts import NotDrawn, attempt, described
 
 
 class Seen(NamedTuple):

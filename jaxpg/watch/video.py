@@ -13,12 +13,12 @@ import jax
 import numpy as np
 
 from envs.scenes import Scene
-from jaxpg.run import folder, policies
-from jaxpg.run.agents import described
-from jaxpg.run.cache import compilation_cache, physics_cache
-from jaxpg.run.errors import UserError
-from jaxpg.run.policies import StoredPolicy
-from jaxpg.run.schema import RenderOptions
+from jaxpg.config.schema import RenderOptions
+from jaxpg.errors import UserError
+from jaxpg.program.agents import described
+from jaxpg.store import folder, policies
+from jaxpg.store.cache import compilation_cache, physics_cache
+from jaxpg.store.policies import StoredPolicy
 from jaxpg.watch import gl, movie
 from jaxpg.watch.clips import Clip, clip, command_names, frames, limits_of
 from jaxpg.watch.recording import record

@@ -11,7 +11,7 @@ sys.path.insert(0, str(Path(__file__).parents[1]))
 from test_bad_input import MISTAKES
 
 from jaxpg import train
-from jaxpg.run.errors import run_command
+from jaxpg.commands.ending import run_command
 
 
 def answer(arguments):

@@ -16,9 +16,10 @@ from hypothesis import strategies as st
 from rounds import examples, rounds
 
 from jaxpg import train
-from jaxpg.run import cache, program
-from jaxpg.run.errors import run_command
-from jaxpg.run.schema import GROUPS, Run
+from jaxpg.commands.ending import run_command
+from jaxpg.config.schema import GROUPS, Run
+from jaxpg.program import compile as program
+from jaxpg.store import cache
 
 BASE = {"env": "quadratic", "num_envs": 2, "total_steps": 32, "eval_episodes": 2, "env.episode_length": 4}
 BASE |= {"report": "false"}  # which takes longer than such a run

@@ -9,7 +9,7 @@ import shutil
 import numpy as np
 import pytest
 
-from jaxpg.run.checkpoint import CheckpointError, Checkpoints
+from jaxpg.store.checkpoint import CheckpointError, Checkpoints
 
 FEW, MANY = range(20, 40), 200  # 27 is one that only the digests of the arrays tell
 STEPS = (1, 2, 3)

@@ -26,8 +26,9 @@ from rounds import examples, rounds
 import envs
 from envs.base import Interface, State
 from jaxpg import export, train
-from jaxpg.run import cache, policies, program
-from jaxpg.run.errors import run_command
+from jaxpg.commands.ending import run_command
+from jaxpg.program import compile as program
+from jaxpg.store import cache, policies
 
 FEW, MANY = 1, 26  # rounds, of a dozen examples and then of 20
 NAMES = ("x", "x", "x", "return", "reward", "value", "length", "success", "distance", "diverged", "update", "steps")

@@ -17,10 +17,10 @@ from hypothesis import strategies as st
 from in_process import contents, ended
 
 from jaxpg import compare, evaluate, export, inspect, report, train
-from jaxpg.run import cache
-from jaxpg.run import config as configuration
-from jaxpg.run.checkpoint import Checkpoints
-from jaxpg.run.folder import RunFolder, read_metrics
+from jaxpg.config import configuration
+from jaxpg.store import cache, config_file
+from jaxpg.store.checkpoint import Checkpoints
+from jaxpg.store.folder import RunFolder, read_metrics
 
 FEW, MANY = 12, 500
 SIZES = ("env=quadratic", "network=linear", "num_envs=2", "num_steps=4", "log_interval=16", "eval_interval=32")
@@ -141,7 +141,7 @@ def is_right(runs, run, command, status, output, error):
     assert (status, error) == (0, ""), error
     if command in ("resume", "begin or resume"):
         config, usual = (
-            configuration.named(configuration.load(path / "config.yaml")) for path in (run, runs / "undisturbed")
+            configuration.named(config_file.load(path / "config.yaml")) for path in (run, runs / "undisturbed")
         )
         if config | {"run_dir": None} == usual | {"run_dir": None}:  # else another interval, say, which may change
             assert digest(run) == digest(runs / "undisturbed")

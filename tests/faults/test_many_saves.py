@@ -6,7 +6,7 @@ import sys
 import numpy as np
 import pytest
 
-from jaxpg.run.checkpoint import Checkpoints
+from jaxpg.store.checkpoint import Checkpoints
 
 SAVES, ARRAYS = 150, 20
 

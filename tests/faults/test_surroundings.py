@@ -13,10 +13,10 @@ import pytest
 from processes import LINES, RUN, has_written, outcome, training
 
 from jaxpg import train
-from jaxpg.run.checkpoint import Checkpoints
-from jaxpg.run.config import compose
-from jaxpg.run.errors import UserError
-from jaxpg.run.runtime import prepare
+from jaxpg.config.parsing import compose
+from jaxpg.errors import UserError
+from jaxpg.program.backend import prepare
+from jaxpg.store.checkpoint import Checkpoints
 
 TRAIN = (sys.executable, "-m", "jaxpg.train")
 

@@ -1,0 +1,96 @@
+"""How commands end: mistakes of the user in one clear line each and status 2; mistakes of ours with their traceback."""
+
+from __future__ import annotations
+
+import errno
+import gc
+import os
+import sys
+import threading
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager, redirect_stderr, redirect_stdout
+from typing import Any, TextIO
+
+from envs.options import OptionError
+from envs.physics import MujocoModelError
+from jaxpg.errors import UserError
+from jaxpg.run.signals import Interrupts
+
+INTERRUPTED = 130  # the exit status, as shells have it
+# What is wrong with a file or a folder of the user's; other OSErrors are mistakes of ours.
+SURROUNDINGS = (errno.EACCES, errno.EPERM, errno.EROFS, errno.ENAMETOOLONG, errno.ELOOP, errno.ENOTDIR, errno.EISDIR)
+SURROUNDINGS += (errno.ENOSPC, errno.EDQUOT, errno.EIO)
+
+
+def run_command(main: Callable[[Sequence[str]], int | None]) -> None:
+    """`sys.exit(main(arguments))`, where a user's mistake ends in its message and status 2."""
+    interrupted = False
+    with _unbreakable_output():
+        try:
+            with Interrupts():
+                status = main(sys.argv[1:])
+        except OptionError as error:
+            status = _report(error.problems)
+        except (UserError, MujocoModelError) as error:
+            status = _report([str(error)])
+        except OSError as error:
+            if error.filename is None or error.errno not in SURROUNDINGS:
+                raise
+            status = _report([f"{os.fsdecode(error.filename)}: {error.strerror}"])
+        except KeyboardInterrupt:
+            print("interrupted", file=sys.stderr)
+            status, interrupted = INTERRUPTED, True
+    if interrupted and threading.active_count() > 1:
+        os._exit(status)  # XLA, which compiles there, cannot be interrupted, and Python would wait for its threads
+    gc.freeze()  # the interpreter's last collections would look through all that jax has made: half a second
+    sys.exit(status)
+
+
+def _report(problems: Sequence[str]) -> int:
+    for problem in problems:
+        print(f"error: {problem}", file=sys.stderr)
+    return 2
+
+
+class Unbreakable:
+    """A text stream that goes on in silence when nobody reads it any more, as behind `| head`, or its disk is full.
+
+    Args:
+      stream: where the text goes; what it has no letter for is written as an escape. None goes nowhere.
+      descriptor: of the stream's file; led to the null device when the stream breaks, with all that waits in it.
+    """
+
+    def __init__(self, stream: TextIO | None, descriptor: int):
+        self._stream = open(os.devnull, "w", encoding="utf-8") if stream is None else stream  # noqa: SIM115
+        self._descriptor = descriptor
+        if hasattr(self._stream, "reconfigure"):
+            self._stream.reconfigure(errors="backslashreplace")
+
+    def write(self, text: str) -> int:
+        return self._try(self._stream.write, text)
+
+    def flush(self) -> None:
+        self._try(self._stream.flush)
+
+    def _try(self, function: Callable, *arguments: Any) -> Any:
+        try:
+            return function(*arguments)
+        except OSError:
+            null = os.open(os.devnull, os.O_WRONLY)
+            os.dup2(null, self._descriptor)
+            os.close(null)
+            return function(*arguments)
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._stream, name)
+
+
+@contextmanager
+def _unbreakable_output() -> Iterator[None]:
+    out, error = Unbreakable(sys.stdout, 1), Unbreakable(sys.stderr, 2)
+    with redirect_stdout(out), redirect_stderr(error):
+        try:
+            yield
+        finally:
+            out.flush()
+            error.flush()

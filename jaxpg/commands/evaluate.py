@@ -1,0 +1,101 @@
+"""`python -m jaxpg.evaluate run=DIR`: plays a trained policy, deterministically, from fixed starts."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Sequence
+from contextlib import AbstractContextManager, nullcontext
+from typing import TYPE_CHECKING, Any
+
+from jaxpg.commands.options import about_a_run_in
+from jaxpg.config.schema import EvaluateOptions
+from jaxpg.errors import UserError
+from jaxpg.store import config_file
+from jaxpg.store.statistics import finite_mean
+
+if TYPE_CHECKING:
+    from jaxpg.watch.episodes import Results
+
+
+def main(arguments: Sequence[str]) -> int:
+    """The evaluation command; returns its exit status."""
+    options, changes = about_a_run_in("evaluate", EvaluateOptions, arguments)
+    if options is None:
+        return 0
+    from jaxpg.store import policies
+    from jaxpg.store.cache import compilation_cache, physics_cache
+    from jaxpg.watch import episodes
+
+    if options.backend == "mujoco":
+        changes |= _in_mujoco(options.run)
+    with physics_cache(options.cache):
+        stored = policies.load(options.run, options.checkpoint, options.agent, changes)
+    play = episodes.play_gymnasium if options.backend == "gymnasium" else episodes.play_own
+    with _playing(stored, options.policy) as player, compilation_cache(options.cache, print):
+        results = play(player, options.episodes, options.seed)
+    how = options.backend if options.policy == "jax" else f"{options.backend}, as {options.policy}"
+    print(f"{stored.config.task}, {stored.agent}, {stored.described(options.checkpoint)}, {how}")
+    for name, value in _rows(results).items():
+        print(f"{name:<8} {value}")
+    if options.json:
+        print(json.dumps(_summary(results), allow_nan=False))
+    return 0
+
+
+def _rows(results: Results) -> dict[str, str]:
+    """What is to be read, by name; an episode that diverged counts as `jaxpg.store.statistics.counted_returns` says."""
+    number, exploded = len(results.returns), int(results.diverged.sum())
+    mean, stderr = _mean(results.returns)
+    rows = {"return": f"{mean:.2f} +- {stderr:.2f} (mean and standard error, {number} episodes)"}
+    if exploded == number:
+        rows["return"] = f"n/a: the physics of all {number} episodes diverged"
+    elif exploded:
+        rows["diverged"] = f"{exploded} of {number} episodes, each counted as the worst of the others, and as 0 at best"
+    for name, values in results.metrics.items():
+        rows[name] = _in_words(name, float(finite_mean(values)))
+    return rows
+
+
+def _in_words(name: str, value: float) -> str:
+    if not math.isfinite(value):
+        return "n/a"
+    return f"{value:.2%}" if name == "success" else f"{value:.4g} on average at the end"
+
+
+def _summary(results: Results) -> dict[str, Any]:
+    """The same as numbers, None where there is none."""
+    mean, stderr = _mean(results.returns)
+    success = finite_mean(results.metrics["success"]) if "success" in results.metrics else math.nan
+    numbers = {"mean": mean, "stderr": stderr, "success": float(success)}
+    counts = {"episodes": len(results.returns), "diverged": int(results.diverged.sum())}
+    return {name: value if math.isfinite(value) else None for name, value in numbers.items()} | counts
+
+
+def _mean(returns: Any) -> tuple[float, float]:
+    """Mean and standard error; NaN where there is none, the latter of a single episode, too."""
+    number = len(returns)
+    return float(returns.mean()), float(returns.std(ddof=1)) / math.sqrt(number) if number > 1 else math.nan
+
+
+def _in_mujoco(run: str) -> dict[str, str]:
+    """The change to the options of this run by which C MuJoCo steps its environment.
+
+    Raises:
+      UserError: no run, or its environment is no model that C MuJoCo could step.
+    """
+    from jaxpg.store import folder
+
+    stored = config_file.load(folder.find(run).config)
+    if not hasattr(stored.env, "physics"):
+        raise UserError(f"backend=mujoco: env={stored.choices['env']} is not stepped by MuJoCo; backend=mjx plays it")
+    return {"env.physics": "mujoco"}
+
+
+def _playing(stored: Any, form: str) -> AbstractContextManager[Any]:
+    """The stored policy as it is, or as exported."""
+    if form == "jax":
+        return nullcontext(stored)
+    from jaxpg.deploy.export import as_written
+
+    return as_written(stored, form)

@@ -1,0 +1,18 @@
+"""`python -m jaxpg.render run=DIR`: episodes of a trained policy as a video."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from jaxpg.commands.options import about_a_run_in
+from jaxpg.config.schema import RenderOptions
+
+
+def main(arguments: Sequence[str]) -> int:
+    """The render command; returns its exit status."""
+    options, changes = about_a_run_in("render", RenderOptions, arguments)
+    if options is not None:
+        from jaxpg.watch import video
+
+        video.render(options, changes, print)
+    return 0

@@ -1,0 +1,32 @@
+"""The environment of a run."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import envs
+from envs.options import OptionError
+from jaxpg.config.configuration import Config
+from jaxpg.features import num_features
+
+MAX_FEATURES = 10_000  # a grid over many observations is soon beyond any memory
+
+
+def make_env(config: Config) -> Any:
+    """The environment; raises OptionError where it has a mistake to report, or where the features do not fit it."""
+    env = envs.of_config(config.choices["env"], config.env)
+    _check_features(config.network, env.observation_size)
+    return env
+
+
+def _check_features(network: Any, observation_size: int) -> None:
+    number = num_features(network.features, observation_size, network.order)
+    if number > MAX_FEATURES:
+        name = f"network.features={network.features} network.order={network.order}"
+        raise OptionError([f"{name}: {number:,} features of {observation_size} observations; at most {MAX_FEATURES:,}"])
+
+
+def training_length(config: Config) -> int:
+    """Steps of a training episode; TD may cut it before the time limit, where it bootstraps all the same."""
+    limit = config.env.episode_length
+    return min(config.algo.episode_length or limit, limit)

@@ -1,0 +1,69 @@
+"""Complete episodes of a stored policy, in its own environment or in Gymnasium's."""
+
+from __future__ import annotations
+
+import functools
+from typing import NamedTuple
+
+import jax
+import numpy as np
+
+import envs
+from envs.hints import pip_install
+from jaxpg.errors import UserError
+from jaxpg.evaluation import evaluate
+from jaxpg.store.names import own_metrics
+from jaxpg.store.policies import StoredPolicy
+from jaxpg.store.statistics import counted_returns
+
+
+class Results(NamedTuple):
+    """N episodes.
+
+    Attributes:
+      returns: at what they count (`counted_returns`), `[N]`.
+      diverged: whether the physics did, `[N]` of bool.
+      metrics: the environment's, of the last step, `[N]` by their names among ours (`own_metrics`).
+    """
+
+    returns: np.ndarray
+    diverged: np.ndarray
+    metrics: dict[str, np.ndarray]
+
+
+def play_own(stored: StoredPolicy, num_episodes: int, seed: int) -> Results:
+    """Episodes in the environment that the policy was trained on; the seed fixes the starts."""
+
+    @jax.jit
+    def play(policy, key):
+        act = functools.partial(stored.act, policy)
+        return evaluate(stored.env, act, jax.random.split(key, num_episodes), stored.config.env.episode_length)
+
+    episodes = jax.tree.map(np.asarray, play(stored.policy, jax.random.key(seed)))
+    returns = counted_returns(episodes.episode_return, episodes.diverged)
+    return Results(returns, episodes.diverged, own_metrics(episodes.metrics))
+
+
+def play_gymnasium(stored: StoredPolicy, num_episodes: int, seed: int) -> Results:
+    """Episodes in Gymnasium's Pendulum-v1, started with the seeds seed, seed + 1, ...
+
+    Raises:
+      UserError: another environment than the pendulum with Gymnasium's constants, or Gymnasium is not installed.
+    """
+    if stored.config.choices["env"] != "pendulum" or stored.config.env != envs.REGISTRY["pendulum"].config():
+        raise UserError("backend=gymnasium plays Pendulum-v1: it takes runs of env=pendulum with its default options")
+    try:
+        import gymnasium
+    except ImportError:
+        raise UserError(f"backend=gymnasium needs Gymnasium: {pip_install('gymnasium')}") from None
+    pendulums = gymnasium.make_vec("Pendulum-v1", num_envs=num_episodes, vectorization_mode="sync")
+    limit = pendulums.single_action_space.high
+    act = jax.jit(stored.act)
+    obs, _ = pendulums.reset(seed=seed)
+    returns = np.zeros(num_episodes)
+    truncated = np.zeros(num_episodes, bool)
+    while not truncated.all():  # Pendulum-v1 never terminates: all episodes end together at its time limit
+        obs, reward, _, truncated, _ = pendulums.step(limit * np.asarray(act(stored.policy, obs)))
+        returns += reward
+    pendulums.close()
+    return Results(returns, np.zeros(num_episodes, bool), {})
