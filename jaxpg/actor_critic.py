@@ -13,9 +13,9 @@ import jax
 import jax.numpy as jnp
 import optax
 
-from jaxpg import baselines, collectives, divergence, estimators, normalization
+from jaxpg import collectives, divergence, estimators, normalization
 from jaxpg.distributions import gaussian_sample
-from jaxpg.estimators import Estimate
+from jaxpg.estimators import Estimate, Estimator
 from jaxpg.learning import Batch, Reuse, actor_critic_loss, one_step, several_steps
 from jaxpg.networks import Networks
 from jaxpg.returns import discount_factors
@@ -42,10 +42,7 @@ class Method(NamedTuple):
     estimate: Callable[[Transition, jax.Array, jax.Array, jax.Array, jax.Array], Estimate]
 
 
-ESTIMATORS = ("td_lambda", "td_zero", "n_step", "monte_carlo")
-
-
-def td(gamma: float, lambda_: float, num_steps: int, estimator: str = "td_lambda", n: int = 5) -> Method:
+def td(gamma: float, num_steps: int, estimate: Estimator = estimators.gae(0.95)) -> Method:
     """Temporal differences: short rollouts that go on where the last one stopped, and bootstrap.
 
     Termination sets the discount to 0. A time limit or the end of the rollout stops the lambda-sum and bootstraps
@@ -53,12 +50,9 @@ def td(gamma: float, lambda_: float, num_steps: int, estimator: str = "td_lambda
 
     Args:
       gamma: discount, in [0, 1].
-      lambda_: 0 for the one-step TD error, 1 for Monte Carlo with a bootstrap at cuts.
       num_steps: T, length of a rollout.
-      estimator: one of `ESTIMATORS`; td_zero and monte_carlo are td_lambda with lambda 0 and 1.
-      n: rewards that n_step sums.
+      estimate: `estimators.gae(lambda_)`, `estimators.n_rewards(n)`, or one's own function of the same arguments.
     """
-    lambda_ = {"td_zero": 0.0, "monte_carlo": 1.0}.get(estimator, lambda_)
 
     def start(env, key):
         key_reset, key_stagger = jax.random.split(key)
@@ -67,35 +61,49 @@ def td(gamma: float, lambda_: float, num_steps: int, estimator: str = "td_lambda
     def collect(env, policy_fn, env_state, key):
         return rollout(policy_fn, env.step, env_state, key, num_steps)
 
-    def estimate(transition, weight, value, next_value, squared_score):
+    def estimate_of(transition, weight, value, next_value, squared_score):
         discount = gamma * (1 - transition.terminated)
-        continues = 1 - transition.truncated
-        if estimator == "n_step":
-            return estimators.n_step(transition.reward, discount, value, next_value, n, continues)
-        return estimators.td_lambda(transition.reward, discount, value, next_value, lambda_ * continues)
+        return estimate(transition.reward, discount, value, next_value, 1 - transition.truncated)
 
-    return Method(start, collect, lambda transition: jnp.ones_like(transition.reward), estimate)
+    return Method(start, collect, lambda transition: jnp.ones_like(transition.reward), estimate_of)
 
 
-# What is subtracted from the returns, of (returns, weight, value, squared_score).
-BASELINES: dict[str, Callable[..., jax.Array | float]] = {
-    "none": lambda *_: 0.0,
-    "mean": lambda returns, weight, *_: baselines.batch_mean(returns, weight),
-    "time_mean": lambda returns, weight, *_: baselines.time_mean(returns, weight),
-    "leave_one_out": lambda returns, weight, *_: baselines.leave_one_out(returns, weight),
-    "optimal": lambda returns, weight, _, squared_score: baselines.optimal(returns, squared_score, weight),
-    "value": lambda _, weight, value, squared_score: value,
-}
-RETURNS = {"to_go": estimators.reinforce, "whole": estimators.reinforce_whole}
+# baseline(returns, weight, value, squared_score) -> what is subtracted from the returns
+Baseline = Callable[[jax.Array, jax.Array, jax.Array, jax.Array], jax.Array | float]
 
 
-def reinforce(gamma: float, baseline: str, returns: str = "to_go", discounted: bool = False) -> Method:
+def of_returns(baseline: Callable[[jax.Array, jax.Array], jax.Array]) -> Baseline:
+    """A baseline of the returns and their weights alone, such as `baselines.leave_one_out`."""
+    return lambda returns, weight, value, squared_score: baseline(returns, weight)
+
+
+def of_scores(baseline: Callable[[jax.Array, jax.Array, jax.Array], jax.Array]) -> Baseline:
+    """A baseline that looks at the squared scores too, as `baselines.optimal`."""
+    return lambda returns, weight, value, squared_score: baseline(returns, squared_score, weight)
+
+
+def critic(returns: jax.Array, weight: jax.Array, value: jax.Array, squared_score: jax.Array) -> jax.Array:
+    """The critic's V(s_t) as baseline."""
+    return value
+
+
+def no_baseline(returns: jax.Array, weight: jax.Array, value: jax.Array, squared_score: jax.Array) -> float:
+    """0 as baseline."""
+    return 0.0
+
+
+def reinforce(
+    gamma: float,
+    baseline: Baseline = critic,
+    returns: Callable[[jax.Array, jax.Array], Estimate] = estimators.reinforce,
+    discounted: bool = False,
+) -> Method:
     """REINFORCE: whole episodes from a fresh reset to the time limit, masked after termination; no bootstrap.
 
     Args:
       gamma: discount, in [0, 1].
-      baseline: a name in `BASELINES`.
-      returns: a name in `RETURNS`: "to_go" is from each step on, "whole" that of the episode, at each of its steps.
+      baseline: `critic`, `no_baseline`, or one of `jaxpg.baselines` made by `of_returns` or `of_scores`.
+      returns: `estimators.reinforce` counts them from each step on, `estimators.reinforce_whole` for the episode.
       discounted: advantages times gamma^t, which makes the estimate that of the gradient of J; with whole returns it is
         so without.
     """
@@ -112,8 +120,8 @@ def reinforce(gamma: float, baseline: str, returns: str = "to_go", discounted: b
     def estimate(transition, weight, value, next_value, squared_score):
         reward = weight * transition.reward
         discount = gamma * (1 - transition.terminated)
-        earned, target = RETURNS[returns](reward, discount)
-        advantage = earned - BASELINES[baseline](earned, weight, value, squared_score)
+        earned, target = returns(reward, discount)
+        advantage = earned - baseline(earned, weight, value, squared_score)
         if discounted:
             advantage = discount_factors(discount) * advantage
         return Estimate(advantage, target)
@@ -292,13 +300,3 @@ def sampling_policy(networks: Networks, params: PyTree, normalizer: PyTree) -> P
         return u, networks.distribution.action(u)
 
     return policy_fn
-
-
-def deterministic_policy(networks: Networks, params: PyTree, normalizer: PyTree) -> Callable[[jax.Array], jax.Array]:
-    """`policy(obs) -> action`: that of the Gaussian's mean."""
-
-    def policy(obs):
-        mean, _ = networks.policy(params["actor"], normalization.normalize(normalizer, obs))
-        return networks.distribution.action(mean)
-
-    return policy

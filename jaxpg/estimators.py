@@ -21,6 +21,7 @@ Bias is with respect to the gradient that leaves out the factor gamma^t, as the 
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import NamedTuple
 
 import jax
@@ -180,6 +181,31 @@ def td_lambda(
     """
     returns = lambda_returns(reward, discount, next_value, lambda_)
     return Estimate(returns - same(value, returns, "value"), returns)
+
+
+# estimate(reward, discount, value, next_value, continues) -> Estimate, of steps that may be cut
+Estimator = Callable[[jax.Array, jax.Array, jax.Array, jax.Array, jax.Array], Estimate]
+
+
+def gae(lambda_: jax.Array | float) -> Estimator:
+    """`td_lambda` of steps that may be cut: lambda_t = lambda continues_t.
+
+    lambda 0 is the one-step TD error; lambda 1 is Monte Carlo minus value, with a bootstrap at cuts.
+    """
+
+    def estimate(reward, discount, value, next_value, continues):
+        return td_lambda(reward, discount, value, next_value, lambda_ * continues)
+
+    return estimate
+
+
+def n_rewards(n: int) -> Estimator:
+    """`n_step` of steps that may be cut, with n rewards and then the critic."""
+
+    def estimate(reward, discount, value, next_value, continues):
+        return n_step(reward, discount, value, next_value, n, continues)
+
+    return estimate
 
 
 def normalize_advantages(

@@ -12,19 +12,21 @@ from probes import Constant, Counter, Target
 from envs.base import State
 from jaxpg import normalization
 from jaxpg.actor_critic import (
-    BASELINES,
     Method,
     actor_critic,
     batch_of,
-    deterministic_policy,
+    critic,
+    no_baseline,
     reinforce,
     sampling_policy,
     td,
 )
-from jaxpg.estimators import td_lambda
+from jaxpg.estimators import gae, td_lambda
 from jaxpg.evaluation import evaluate
 from jaxpg.learning import Reuse
 from jaxpg.networks import mlp_networks
+from jaxpg.policy import deterministic_policy
+from jaxpg.program.algorithms import BASELINES
 from jaxpg.training import initial_state, train_scan
 from jaxpg.vector_env import vectorize
 
@@ -49,7 +51,7 @@ def learned_value(method, gamma=0.9):
 
 def td_truncation_as_termination(gamma, lambda_, num_steps):
     """The usual mistake: a time limit taken for a terminal state."""
-    right = td(gamma, lambda_, num_steps)
+    right = td(gamma, num_steps, gae(lambda_))
 
     def estimate(transition, weight, value, next_value, squared_score):
         wrong = transition._replace(terminated=transition.terminated + transition.truncated)
@@ -65,13 +67,13 @@ def td_through_the_reset(gamma, lambda_, num_steps):
         discount = gamma * (1 - transition.terminated)
         return td_lambda(transition.reward, discount, value, next_value, lambda_)
 
-    return td(gamma, lambda_, num_steps)._replace(estimate=estimate)
+    return td(gamma, num_steps, gae(lambda_))._replace(estimate=estimate)
 
 
 @pytest.mark.parametrize("lambda_", [0.0, 0.95])
 def test_value_of_an_endless_task_with_a_time_limit(lambda_):
     """V = 1 / (1 - gamma) = 10, to 2 %."""
-    assert learned_value(td(0.9, lambda_, num_steps=5)) == pytest.approx(10, rel=0.02)
+    assert learned_value(td(0.9, 5, gae(lambda_))) == pytest.approx(10, rel=0.02)
 
 
 def test_value_is_wrong_if_truncation_is_taken_for_termination():
@@ -98,7 +100,7 @@ def counter_advantages(method):
 
 def test_lambda_sum_stops_at_the_time_limit():
     """At the last step of an episode the advantage is the TD error, whatever happens in the next episode."""
-    steps, value, next_value, estimate = counter_advantages(td(0.9, 0.95, num_steps=9))
+    steps, value, next_value, estimate = counter_advantages(td(0.9, 9, gae(0.95)))
     expected = steps.reward + 0.9 * next_value - value
     np.testing.assert_allclose(estimate.advantage[4], expected[4], rtol=1e-5, atol=1e-6)
     *_, wrong = counter_advantages(td_through_the_reset(0.9, 0.95, num_steps=9))
@@ -108,10 +110,10 @@ def test_lambda_sum_stops_at_the_time_limit():
 def test_reinforce_returns_are_those_of_whole_episodes():
     """Reward 1 and death after 3 steps: G = 3, 2, 1, and what follows the end has weight 0."""
     env = Counter(life=3)
-    networks, _ = make(env, reinforce(1.0, "none"))
+    networks, _ = make(env, reinforce(1.0, no_baseline))
     vector = vectorize(env, 4, 5)
     policy_fn = sampling_policy(networks, networks.init(new_key()), normalization.init(2))
-    method = reinforce(1.0, "none")
+    method = reinforce(1.0, no_baseline)
     _, steps = method.collect(vector, policy_fn, vector.reset(new_key()), jax.random.key(1))
     weight = method.weight(steps)
     np.testing.assert_array_equal(weight[:, 0], [1, 1, 1, 0, 0])
@@ -119,7 +121,9 @@ def test_reinforce_returns_are_those_of_whole_episodes():
     np.testing.assert_array_equal(estimate.advantage[:3, 0], [3, 2, 1])
 
 
-@pytest.mark.parametrize("method", [td(0.9, 0.95, 4), *(reinforce(0.9, baseline) for baseline in BASELINES)])
+@pytest.mark.parametrize(
+    "method", [td(0.9, 4, gae(0.95)), *(reinforce(0.9, baseline) for baseline in BASELINES.values())]
+)
 def test_finds_the_best_action_of_a_one_step_task(method):
     networks, algorithm = make(Target(), method, num_envs=64, episode_length=2, learning_rate=1e-2)
     state, _ = jax.jit(lambda key: train_scan(algorithm, key, 400))(new_key())
@@ -133,7 +137,7 @@ def equal_bits(a, b):
 
 def test_scan_is_a_loop_over_steps():
     """One scan against update after update; separate programs, so equal to rounding."""
-    _, algorithm = make(Counter(), td(0.9, 0.95, 4))
+    _, algorithm = make(Counter(), td(0.9, 4, gae(0.95)))
     scanned, _ = jax.jit(lambda key: train_scan(algorithm, key, 5))(new_key())
     state, step = initial_state(algorithm, new_key()), jax.jit(algorithm.step)
     for i in range(5):
@@ -141,7 +145,7 @@ def test_scan_is_a_loop_over_steps():
     jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-5, atol=1e-6), scanned, state)
 
 
-@pytest.mark.parametrize("method", [td(0.9, 0.95, 4), reinforce(0.9, "value")])
+@pytest.mark.parametrize("method", [td(0.9, 4, gae(0.95)), reinforce(0.9, critic)])
 @pytest.mark.parametrize("chunk", [1, 2, 3])
 def test_training_in_chunks_is_training_in_one_piece(method, chunk):
     """To the bit: state and metrics."""
@@ -157,7 +161,7 @@ def test_training_in_chunks_is_training_in_one_piece(method, chunk):
 
 
 def test_vmapped_seeds_are_single_seeds():
-    _, algorithm = make(Counter(life=7), td(0.9, 0.95, 4))
+    _, algorithm = make(Counter(life=7), td(0.9, 4, gae(0.95)))
     train = lambda key: train_scan(algorithm, key, 10)  # noqa: E731
     # Off: under vmap JAX turns cond into a select over its operands, and its checker takes that for a second use.
     with jax.debug_key_reuse(False):
@@ -170,7 +174,7 @@ def test_vmapped_seeds_are_single_seeds():
 
 def test_training_is_one_outer_scan():
     """The jaxpr of the training has exactly one scan at its top, with rollout and update in its body."""
-    _, algorithm = make(Counter(), td(0.9, 0.95, 4))
+    _, algorithm = make(Counter(), td(0.9, 4, gae(0.95)))
     state = initial_state(algorithm, new_key())
     jaxpr = jax.make_jaxpr(lambda key, state: train_scan(algorithm, key, 5, state))(new_key(), state)
     scans = [eqn for eqn in jaxpr.eqns if eqn.primitive.name == "scan"]
@@ -188,7 +192,7 @@ def test_policy_is_not_moved_by_the_critics_error():
         estimate = td_lambda(transition.reward, 0.9, value, next_value, 0.95)
         return estimate._replace(advantage=jnp.zeros_like(value))
 
-    method: Method = td(0.9, 0.95, 4)._replace(estimate=no_advantage)
+    method: Method = td(0.9, 4, gae(0.95))._replace(estimate=no_advantage)
     _, algorithm = make(Counter(), method, normalize_advantages=False)
     before = initial_state(algorithm, new_key())
     after, metrics = jax.jit(algorithm.step)(before, jax.random.key(1))
@@ -200,11 +204,11 @@ def test_policy_is_not_moved_by_the_critics_error():
 
 def test_one_unclipped_step_of_ppo_is_td():
     """The surrogate's gradient at a ratio of 1 is the policy gradient; to rounding of the ratio."""
-    _, once = make(Counter(), td(0.9, 0.95, 4))
-    _, reused = make(Counter(), td(0.9, 0.95, 4), reuse=Reuse(epochs=1, minibatches=1, clip=None))
+    _, once = make(Counter(), td(0.9, 4, gae(0.95)))
+    _, reused = make(Counter(), td(0.9, 4, gae(0.95)), reuse=Reuse(epochs=1, minibatches=1, clip=None))
     left, right = (jax.jit(lambda key, a=a: train_scan(a, key, 20))(new_key())[0] for a in (once, reused))
     jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-4, atol=1e-6), left.params, right.params)
-    _, again = make(Counter(), td(0.9, 0.95, 4), reuse=Reuse(epochs=2, minibatches=1, clip=None))
+    _, again = make(Counter(), td(0.9, 4, gae(0.95)), reuse=Reuse(epochs=2, minibatches=1, clip=None))
     other, _ = jax.jit(lambda key: train_scan(again, key, 20))(new_key())
     assert max(abs(a - b).max() for a, b in zip(*map(jax.tree.leaves, (left.params, other.params)), strict=True)) > 1e-3
 
@@ -212,10 +216,10 @@ def test_one_unclipped_step_of_ppo_is_td():
 @pytest.mark.parametrize("limit", [3, 5, 7])
 def test_advantages_are_of_the_values_of_both_normalized_observations(limit):
     """A = 2 r + gamma V(s') - V(s) of TD(0), with the true next observation at time limits; rollouts short and long."""
-    networks, _ = make(Counter(), td(0.9, 0.0, 5))
+    networks, _ = make(Counter(), td(0.9, 5, gae(0.0)))
     params, vector = networks.init(new_key()), vectorize(Counter(life=4), 12, limit)
     statistics = normalization.update(normalization.init(2), jnp.array([[1.0, 2.0], [4.0, -3.0]]))
-    method, policy_fn = td(0.9, 0.0, 5), sampling_policy(networks, params, statistics)
+    method, policy_fn = td(0.9, 5, gae(0.0)), sampling_policy(networks, params, statistics)
     _, steps = method.collect(vector, policy_fn, method.start(vector, new_key()), jax.random.key(1))
     batch = batch_of(networks, method, limit, 2.0, False)(params, statistics, steps)
     value, next_value = (
@@ -230,7 +234,12 @@ def test_advantages_are_of_the_values_of_both_normalized_observations(limit):
 
 def test_finds_the_best_action_from_few_rollouts():
     networks, algorithm = make(
-        Target(), td(0.9, 0.95, 4), num_envs=64, episode_length=2, learning_rate=1e-2, reuse=Reuse(10, 2, max_kl=0.1)
+        Target(),
+        td(0.9, 4, gae(0.95)),
+        num_envs=64,
+        episode_length=2,
+        learning_rate=1e-2,
+        reuse=Reuse(10, 2, max_kl=0.1),
     )
     state, _ = jax.jit(lambda key: train_scan(algorithm, key, 40))(new_key())
     act = deterministic_policy(networks, state.params, state.normalizer)
@@ -250,7 +259,7 @@ def test_evaluation_counts_each_episode_once_to_its_end():
 
 def test_state_fields_are_all_carried():
     """A checkpoint of the state is enough: nothing of the training is hidden elsewhere."""
-    _, algorithm = make(Counter(), td(0.9, 0.95, 4))
+    _, algorithm = make(Counter(), td(0.9, 4, gae(0.95)))
     state, _ = train_scan(algorithm, new_key(), 2)
     copy = jax.tree.map(lambda x: jnp.array(np.asarray(x)), state)
     equal_bits(train_scan(algorithm, new_key(), 2, state), train_scan(algorithm, new_key(), 2, copy))
@@ -279,7 +288,7 @@ class Sides:
 @pytest.mark.parametrize(("unit", "origin"), [(1.0, 0.0), (1e-6, 0.0), (1e-3, 3.0), (1e5, 0.0), (0.1, 1e5)])
 def test_units_of_the_observations_do_not_matter(unit, origin):
     """Micrometres, an offset of 10^4 with a deviation of 0.1: the sides are told apart as in units of size 1."""
-    networks, made = make(Sides(unit, origin), td(0.5, 0.9, 5), num_envs=32, episode_length=5, learning_rate=1e-2)
+    networks, made = make(Sides(unit, origin), td(0.5, 5, gae(0.9)), num_envs=32, episode_length=5, learning_rate=1e-2)
     state, _ = jax.jit(lambda: train_scan(made, new_key(), 150))()
     obs = jax.vmap(Sides(unit, origin).observe)(jnp.array([-1.0, -0.5, 0.5, 1.0]))
     action = deterministic_policy(networks, state.params, state.normalizer)(obs)[:, 0]

@@ -20,6 +20,7 @@ from envs.physics import PHYSICS, MujocoModelError, compile_step
 from envs.physics.callback import Simulations
 from envs.physics.fields import INPUTS, OUTPUTS, types_of
 from jaxpg.actor_critic import actor_critic, td
+from jaxpg.estimators import gae
 from jaxpg.networks import mlp_networks
 from jaxpg.shards import AXIS, sharded
 from jaxpg.training import train_scan
@@ -155,7 +156,7 @@ def training(num_shards):
     env, several = envs.make("arm", physics="mujoco"), num_shards > 1
     batch, networks = vectorize(env, 32 // num_shards, 20), mlp_networks(env.observation_size, env.action_size, (8,))
     optimizer, axis_name = optax.adam(0.01), AXIS if several else None
-    algorithm = actor_critic(batch, networks, optimizer, td(0.9, 0.9, 5), axis_name=axis_name)
+    algorithm = actor_critic(batch, networks, optimizer, td(0.9, 5, gae(0.9)), axis_name=axis_name)
     algorithm = sharded(algorithm, num_shards, jax.devices()) if several else algorithm
     return jax.jit(lambda key: jax.tree.leaves(train_scan(algorithm, key, num_updates=20)[0].params))
 

@@ -12,8 +12,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from envs.base import State
-from jaxpg.actor_critic import actor_critic, reinforce, td
+from jaxpg.actor_critic import actor_critic, of_returns, reinforce, td
+from jaxpg.baselines import leave_one_out
 from jaxpg.divergence import BOUND, diverged, lasting
+from jaxpg.estimators import gae
 from jaxpg.learning import Reuse
 from jaxpg.networks import linear_networks, mlp_networks
 from jaxpg.online import online_actor_critic
@@ -160,7 +162,7 @@ def algorithm(name, env, networks="mlp", num_envs=12, episode_length=STEPS, **op
     if name == "online":
         return online_actor_critic(batch, networks, num_steps=STEPS, **SHARED, **options)
     reuse = Reuse(epochs=2, minibatches=2) if name == "ppo" else None
-    method = reinforce(0.9, "leave_one_out") if name == "reinforce" else td(0.9, 0.9, STEPS)
+    method = reinforce(0.9, of_returns(leave_one_out)) if name == "reinforce" else td(0.9, STEPS, gae(0.9))
     return actor_critic(batch, networks, optax.adam(1e-2), method, reuse=reuse, **options)
 
 

@@ -27,7 +27,7 @@ LEVELS = [
         "compatibility",
         "collectives",
     },
-    {"networks", "vector_env"},
+    {"networks", "vector_env", "policy"},
     {"rollout", "learning", "actor_critic", "online", "training", "soundness", "shards", "evaluation"},
     {"config"},
     {"program"},

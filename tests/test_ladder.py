@@ -5,9 +5,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxpg.actor_critic import BASELINES, ESTIMATORS
 from jaxpg.config.parsing import compose
-from jaxpg.program.algorithms import make_algorithm, reinforce_method, td_method
+from jaxpg.program.algorithms import BASELINES, ESTIMATORS, make_algorithm, reinforce_method, td_method
 from jaxpg.program.environment import make_env
 from jaxpg.training import initial_state, train_scan
 from jaxpg.types import Transition

@@ -11,6 +11,7 @@ from probes import Counter
 
 from jaxpg import normalization
 from jaxpg.actor_critic import batch_of, sampling_policy, td
+from jaxpg.estimators import gae
 from jaxpg.learning import Reuse, actor_critic_loss, several_steps, shuffled_parts
 from jaxpg.networks import mlp_networks
 from jaxpg.vector_env import vectorize
@@ -20,7 +21,7 @@ NETWORKS = mlp_networks(2, 1, (8,))
 
 def a_batch(params):
     """The first rollout of six episodes of `Counter`, five steps."""
-    method, vector, statistics = td(0.9, 0.95, 5), vectorize(Counter(), 6, 10), normalization.init(2)
+    method, vector, statistics = td(0.9, 5, gae(0.95)), vectorize(Counter(), 6, 10), normalization.init(2)
     policy_fn = sampling_policy(NETWORKS, params, statistics)
     _, steps = method.collect(vector, policy_fn, vector.reset(jax.random.key(0)), jax.random.key(1))
     return batch_of(NETWORKS, method, 10, 1.0, True)(params, statistics, steps)

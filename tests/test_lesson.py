@@ -122,7 +122,8 @@ def test_a_wrong_reference_is_seen(wrong):
 
 def test_right_references_are_not_reported():
     text = (
-        "`jaxpg/returns.py:td_errors`, `jaxpg/actor_critic.py:BASELINES`, `jaxpg/online.py:Traces`, `jaxpg/losses.py`"
+        "`jaxpg/returns.py:td_errors`, `jaxpg/program/algorithms.py:BASELINES`, `jaxpg/online.py:Traces`, "
+        "`jaxpg/losses.py`"
     )
     assert len(references(text)) == 3
     assert missing(text) == []

@@ -23,10 +23,11 @@ from jaxpg.normalization import RunningStatistics
 from jaxpg.program.networks import make_networks
 from jaxpg.program.state import Policy
 from jaxpg.store.folder import RunFolder
-from jaxpg.store.policies import stored_policy, untrained
+from jaxpg.store.policies import stored_policy
 from jaxpg.watch import attempts, player, report
 from jaxpg.watch.attempts import NotDrawn, attempt
 from jaxpg.watch.page import page
+from jaxpg.watch.untrained import untrained
 
 ROBOT = """<mujoco><worldbody>
   <body><joint name="slide" type="slide" axis="1 0 0"/><geom type="box" size=".2 .1 .05" {more}/>

@@ -13,11 +13,11 @@ from jaxpg.evaluation import evaluate
 from jaxpg.program.algorithms import make_algorithm
 from jaxpg.program.networks import make_networks
 from jaxpg.program.state import initial_run
-from jaxpg.store.policies import untrained
 from jaxpg.watch import drawing
 from jaxpg.watch.clips import clip
 from jaxpg.watch.player import in_plane
 from jaxpg.watch.recording import record, value_map
+from jaxpg.watch.untrained import untrained
 
 STARTS = 5
 PENDULUM = ("env=pendulum", "network.widths=[8]", "env.episode_length=40", "num_envs=2", "algo.num_shards=1")

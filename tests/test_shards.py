@@ -15,7 +15,7 @@ from test_learning import NETWORKS, a_batch
 
 from jaxpg import collectives, normalization
 from jaxpg.actor_critic import actor_critic, td
-from jaxpg.estimators import normalize_advantages
+from jaxpg.estimators import gae, normalize_advantages
 from jaxpg.learning import Reuse, actor_critic_loss, one_step, several_steps
 from jaxpg.shards import AXIS, in_parts, sharded
 from jaxpg.soundness import sound
@@ -34,7 +34,7 @@ def algorithm(reuse, num_envs, axis_name, life=4):
         vectorize(Counter(life), num_envs, 7),
         NETWORKS,
         optax.adam(0.01),
-        td(0.9, 0.95, 5),
+        td(0.9, 5, gae(0.95)),
         reuse=reuse,
         entropy_coef=0.01,
         axis_name=axis_name,

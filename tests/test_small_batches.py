@@ -10,11 +10,10 @@ import pytest
 import envs
 from envs.base import initial_state
 from envs.options import OptionError, option
-from jaxpg.actor_critic import BASELINES
 from jaxpg.config.conflicts import OF_OTHER_EPISODES
 from jaxpg.config.parsing import compose
 from jaxpg.estimators import normalize_advantages
-from jaxpg.program.algorithms import make_algorithm
+from jaxpg.program.algorithms import BASELINES, make_algorithm
 from jaxpg.program.environment import make_env
 from jaxpg.training import train_scan
 

@@ -16,8 +16,8 @@ from pathlib import Path  # noqa: E402
 import jax  # noqa: E402
 
 sys.path.insert(0, str(Path(__file__).parents[2]))  # the repository, if it is not installed
-from jaxpg.actor_critic import deterministic_policy  # noqa: E402
 from jaxpg.config.parsing import compose  # noqa: E402
+from jaxpg.policy import deterministic_policy  # noqa: E402
 from jaxpg.program.backend import prepare  # noqa: E402
 from jaxpg.program.compile import compile_program  # noqa: E402
 from jaxpg.program.environment import make_env  # noqa: E402

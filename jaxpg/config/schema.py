@@ -14,11 +14,13 @@ from typing import Any, ClassVar, NamedTuple
 
 import envs
 from envs.options import option
-from jaxpg.actor_critic import BASELINES, ESTIMATORS, RETURNS
 from jaxpg.features import FEATURES
 from jaxpg.networks import ACTIVATIONS, SIGMAS
-from jaxpg.soundness import POLICIES
 
+# The names of what jaxpg/program/algorithms.py has the functions of; a test compares them.
+ESTIMATORS = ("td_lambda", "td_zero", "n_step", "monte_carlo")
+BASELINES = ("none", "mean", "time_mean", "leave_one_out", "optimal", "value")
+RETURNS = ("to_go", "whole")
 LOGGERS = ("wandb", "mlflow")  # besides TensorBoard; jaxpg/store/loggers has a module for each
 LARGEST = 2**31 - 1  # size of an array's axis: XLA's indices are 32-bit numbers
 
@@ -121,8 +123,8 @@ class Reinforce(Learning):
 
     whole_episodes: ClassVar[bool] = True
 
-    baseline: str = option("value", "what is subtracted from the return", choices=tuple(BASELINES))
-    returns: str = option("to_go", "from each step on, or of the whole episode", choices=tuple(RETURNS))
+    baseline: str = option("value", "what is subtracted from the return", choices=BASELINES)
+    returns: str = option("to_go", "from each step on, or of the whole episode", choices=RETURNS)
     discounted: bool = option(False, "advantages times gamma^t, as the gradient of the objective has them")
 
 
@@ -198,7 +200,7 @@ class Run:
     nan_policy: str = option(
         "stop",
         "an update whose numbers are not finite: its agent stops before it, or goes on without",
-        choices=POLICIES,
+        choices=("stop", "skip"),
     )
     checkpoint_interval: int = option(5_000_000, "environment steps between two checkpoints", at_least=1)
     run_dir: str | None = option(None, "run folder [default: runs/<env>-<algo>-s<seed>-<time>]")

@@ -7,15 +7,17 @@ An algorithm is a function here, `build(config, env) -> Algorithm` of one agent,
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Callable
 from typing import Any
 
 import jax
 import optax
 
-from jaxpg import actor_critic, shards
-from jaxpg.actor_critic import Method
+from jaxpg import actor_critic, baselines, estimators, shards
+from jaxpg.actor_critic import Baseline, Method, critic, no_baseline, of_returns, of_scores
 from jaxpg.config.configuration import Config
 from jaxpg.config.schema import ALGORITHMS
+from jaxpg.estimators import Estimator
 from jaxpg.learning import Reuse, scale_by_progress
 from jaxpg.online import online_actor_critic
 from jaxpg.program.environment import training_length
@@ -24,6 +26,22 @@ from jaxpg.program.schedule import plan
 from jaxpg.program.sigma import labels, left_alone, log_sigma, with_sigma
 from jaxpg.types import Algorithm
 from jaxpg.vector_env import vectorize
+
+ESTIMATORS: dict[str, Callable[[Any], Estimator]] = {
+    "td_lambda": lambda algo: estimators.gae(algo.lambda_),
+    "td_zero": lambda algo: estimators.gae(0.0),
+    "n_step": lambda algo: estimators.n_rewards(algo.n),
+    "monte_carlo": lambda algo: estimators.gae(1.0),
+}
+BASELINES: dict[str, Baseline] = {
+    "none": no_baseline,
+    "mean": of_returns(baselines.batch_mean),
+    "time_mean": of_returns(baselines.time_mean),
+    "leave_one_out": of_returns(baselines.leave_one_out),
+    "optimal": of_scores(baselines.optimal),
+    "value": critic,
+}
+RETURNS = {"to_go": estimators.reinforce, "whole": estimators.reinforce_whole}
 
 
 def make_algorithm(config: Config, env: Any) -> Algorithm:
@@ -58,13 +76,13 @@ def online(config: Config, env: Any) -> Algorithm:
 def td_method(config: Config) -> Method:
     """The estimator of the options of TD and PPO."""
     algo = config.algo
-    return actor_critic.td(algo.gamma, algo.lambda_, config.run.num_steps, algo.estimator, algo.n)
+    return actor_critic.td(algo.gamma, config.run.num_steps, ESTIMATORS[algo.estimator](algo))
 
 
 def reinforce_method(config: Config) -> Method:
     """The estimator of the options of REINFORCE."""
     algo = config.algo
-    return actor_critic.reinforce(algo.gamma, algo.baseline, algo.returns, algo.discounted)
+    return actor_critic.reinforce(algo.gamma, BASELINES[algo.baseline], RETURNS[algo.returns], algo.discounted)
 
 
 def make_reuse(config: Config) -> Reuse:

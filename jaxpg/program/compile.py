@@ -13,9 +13,9 @@ import jax
 import numpy as np
 
 from jaxpg import shards
-from jaxpg.actor_critic import deterministic_policy
 from jaxpg.config.configuration import Config
 from jaxpg.evaluation import Episodes, evaluate
+from jaxpg.policy import deterministic_policy
 from jaxpg.program.agents import Agents, agents_of, with_values
 from jaxpg.program.algorithms import make_algorithm
 from jaxpg.program.backend import OPTIMIZED, RUN_ONCE

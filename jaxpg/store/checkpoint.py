@@ -232,19 +232,22 @@ class Checkpoints:
                 raise CheckpointError(f"{self.folder / str(step)}: damaged, {name} differs from what was saved")
         return leaves
 
-    def restore(self, step: int, template: PyTree) -> PyTree:
-        """The tree of checkpoint `step`, every leaf verified.
+    def restore(self, step: int, template: PyTree, part: str = "") -> PyTree:
+        """The tree of checkpoint `step`, or what of a part of it is asked for, every leaf verified.
 
         Args:
           step: its number.
           template: a tree of the same structure, of arrays or of shapes and types.
+          part: such as "train": the template is of leaves below it, of which there may be more.
 
         Raises:
           CheckpointError: it cannot be read, was made by another program, or its content is damaged.
         """
         paths, structure = jax.tree_util.tree_flatten_with_path(template)
-        expected = {name_of(path): leaf for path, leaf in paths}
-        self._check_same_program(step, self.record(step)["leaves"], expected)
+        expected = {f"{part}/{name_of(path)}".lstrip("/"): leaf for path, leaf in paths}
+        recorded = self.record(step)["leaves"]
+        wanted = {name: leaf for name, leaf in recorded.items() if name in expected or not part}
+        self._check_same_program(step, wanted, expected)
         arrays = self.read(step)
         leaves = [from_storage(arrays[name], leaf) for name, leaf in expected.items()]
         return jax.tree_util.tree_unflatten(structure, leaves)

@@ -10,16 +10,15 @@ import numpy as np
 
 from envs.base import Interface, interface
 from jaxpg import normalization
-from jaxpg.actor_critic import deterministic_policy
 from jaxpg.config import configuration
 from jaxpg.config.configuration import Config
 from jaxpg.errors import UserError
+from jaxpg.policy import deterministic_policy, value_function
 from jaxpg.program.agents import alone, described_agent
-from jaxpg.program.algorithms import make_algorithm
-from jaxpg.program.backend import RUN_ONCE, prepare
+from jaxpg.program.backend import prepare
 from jaxpg.program.environment import make_env
 from jaxpg.program.networks import make_networks
-from jaxpg.program.state import Policy, current_policy, initial_run, state_shape
+from jaxpg.program.state import Best, Policy
 from jaxpg.store import config_file, folder, same_run
 from jaxpg.store.checkpoint import Checkpoints
 from jaxpg.store.names import own_interface
@@ -91,16 +90,17 @@ def load_several(
     config = configuration.change(stored, changes or {})
     prepare(config)  # environments of other libraries may hang without
     env = make_env(config)
-    shape = state_shape(make_algorithm(config, env), config.num_agents)
-    best, update = _restore(Checkpoints(run_folder.best, read_only=True), shape.best, stored)
+    shape = _shape(config, env)
+    best, update = _restore(Checkpoints(run_folder.best, read_only=True), shape, stored)
     if agent is None:
         agent = int(np.argmax(best.episode_return))
     if not 0 <= agent < config.num_agents:
         raise UserError(f"agent={agent}: the run has agents 0 to {config.num_agents - 1}")
     found: dict[str, tuple[Policy, int]] = {"best": (best.policy, update)}
     if "last" in kinds:
-        state, update = _restore(Checkpoints(run_folder.checkpoints, read_only=True), shape, stored)
-        found["last"] = current_policy(state.train), update
+        found["last"] = _restore(
+            Checkpoints(run_folder.checkpoints, read_only=True), shape.policy, stored, part="train"
+        )
     of_agent = {
         kind: (jax.tree.map(lambda x: np.asarray(x)[agent], policy), at) for kind, (policy, at) in found.items()
     }
@@ -116,29 +116,25 @@ def stored_policy(config: Config, env: Any, policy: Policy, update: int, agent: 
     networks, reward_scale = make_networks(config, env), config.algo.reward_scale
 
     def act(policy, obs):
-        return deterministic_policy(networks, policy.params, policy.normalizer)(obs)
+        return deterministic_policy(networks, *policy)(obs)
 
     def value(policy, obs):
-        return networks.value(policy.params["critic"], normalization.normalize(policy.normalizer, obs)) / reward_scale
+        return value_function(networks, *policy, reward_scale)(obs)
 
     return StoredPolicy(act, value, policy, env, own_interface(interface(env)), config, agent, update)
 
 
-def untrained(stored: StoredPolicy) -> StoredPolicy:
-    """The same agent before its first update."""
-
-    def initial(seed):
-        return current_policy(initial_run(make_algorithm(stored.config, stored.env), seed).train)
-
-    seed = np.uint32(stored.config.run.seed)
-    policy = jax.jit(initial).lower(seed).compile(RUN_ONCE)(seed)
-    return stored._replace(policy=jax.tree.map(np.asarray, policy), update=0)
+def _shape(config: Config, env: Any) -> Best:
+    """Shapes and types of what the folder `best` holds; neither optimizer nor environments are needed to know them."""
+    params = jax.eval_shape(make_networks(config, env).init, jax.random.key(0))
+    one = Best(Policy(params, normalization.init(env.observation_size)), np.float32(0))
+    return jax.tree.map(lambda x: jax.ShapeDtypeStruct((config.num_agents, *x.shape), x.dtype), one)
 
 
-def _restore(checkpoints: Checkpoints, template: Any, config: Config) -> tuple[Any, int]:
-    """The newest checkpoint, and the updates made before it; `config` is that of the run folder."""
+def _restore(checkpoints: Checkpoints, template: Any, config: Config, part: str = "") -> tuple[Any, int]:
+    """The newest checkpoint, or a part of it, and the updates made before; `config` is that of the run folder."""
     update = checkpoints.latest()
     if update is None:
         raise UserError(f"{checkpoints.folder}: no checkpoint yet")
     same_run.check_checkpoint(checkpoints, update, config)
-    return checkpoints.restore(update, template), update
+    return checkpoints.restore(update, template, part), update

@@ -28,6 +28,7 @@ from jaxpg.watch.player import episodes
 from jaxpg.watch.recording import Recording, record
 from jaxpg.watch.seen import seen
 from jaxpg.watch.smoothness import NEAR, chatter, share_at_limit
+from jaxpg.watch.untrained import untrained
 
 Json = dict[str, Any]
 Stages = Mapping[str, StoredPolicy]
@@ -55,7 +56,7 @@ def of_run(path: str, agent: int | None, cache: bool, say: Callable[[str], None]
     run_folder = folder.find(path)
     with physics_cache(cache), compilation_cache(cache, say):
         best, last = policies.load_several(path, ["best", "last"], agent)
-        stages = {UNTRAINED: policies.untrained(best)}
+        stages = {UNTRAINED: untrained(best)}
         if best.evaluated:
             stages["best"] = best
         if last.update != best.update or not best.evaluated:

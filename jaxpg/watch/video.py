@@ -23,6 +23,7 @@ from jaxpg.watch import gl, movie
 from jaxpg.watch.clips import Clip, clip, command_names, frames, limits_of
 from jaxpg.watch.recording import record
 from jaxpg.watch.seen import seen
+from jaxpg.watch.untrained import untrained
 
 LARGEST = 8192  # pixels of an image, either way
 FINEST = 10_000  # of the denominator of pictures a second
@@ -89,7 +90,7 @@ def _stored(options: RenderOptions, changes: Mapping[str, Any]) -> StoredPolicy:
     if seen(stored.env, notes.append).scene is None:
         why = f": {'; '.join(notes)}" if notes else " is no robot: there is nothing to be seen of it"
         raise UserError(f"env={stored.config.choices['env']}{why}")
-    return policies.untrained(stored) if options.checkpoint == "untrained" else stored
+    return untrained(stored) if options.checkpoint == "untrained" else stored
 
 
 def played(stored: StoredPolicy, number: int, seed: int) -> list[Clip]:
