@@ -17,11 +17,12 @@ from envs.options import option
 from jaxpg.features import FEATURES
 from jaxpg.networks import ACTIVATIONS, SIGMAS
 
-# The names of what jaxpg/program/algorithms.py has the functions of; a test compares them.
+# The names of functions that are imported later; a test compares them.
 ESTIMATORS = ("td_lambda", "td_zero", "n_step", "monte_carlo")
 BASELINES = ("none", "mean", "time_mean", "leave_one_out", "optimal", "value")
 RETURNS = ("to_go", "whole")
-LOGGERS = ("wandb", "mlflow")  # besides TensorBoard; jaxpg/store/loggers has a module for each
+NAN_POLICIES = ("stop", "skip")
+LOGGERS = ("wandb", "mlflow")  # besides TensorBoard
 LARGEST = 2**31 - 1  # size of an array's axis: XLA's indices are 32-bit numbers
 
 
@@ -150,6 +151,8 @@ class Gaussian:
 
     widths: ClassVar[list[int]] = []
     activation: ClassVar[str] = "tanh"
+    features: ClassVar[str] = "identity"
+    order: ClassVar[int] = 1
 
     sigma: float = number(0.5, "standard deviation of the policy at the beginning, before tanh", above=0)
     sigma_is: str = option(
@@ -200,7 +203,7 @@ class Run:
     nan_policy: str = option(
         "stop",
         "an update whose numbers are not finite: its agent stops before it, or goes on without",
-        choices=("stop", "skip"),
+        choices=NAN_POLICIES,
     )
     checkpoint_interval: int = option(5_000_000, "environment steps between two checkpoints", at_least=1)
     run_dir: str | None = option(None, "run folder [default: runs/<env>-<algo>-s<seed>-<time>]")
