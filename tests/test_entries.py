@@ -11,6 +11,7 @@ from jaxpg import evaluate, export, train
 from jaxpg.actor_critic import actor_critic, td
 from jaxpg.config import schema
 from jaxpg.config.schema import ALGORITHMS, NETWORKS, Common, Entry, Gaussian, number
+from jaxpg.distributions import GAUSSIAN, SQUASHED_GAUSSIAN
 from jaxpg.networks import mlp_networks
 from jaxpg.program import algorithms
 from jaxpg.program.networks import make_networks
@@ -40,7 +41,8 @@ class Narrow(Gaussian):
 
 
 def narrow(options, observation_size, action_size):
-    return mlp_networks(observation_size, action_size, [options.width])
+    distribution = SQUASHED_GAUSSIAN if options.squash else GAUSSIAN
+    return mlp_networks(observation_size, action_size, [options.width], distribution=distribution)
 
 
 SIZES = ("num_envs=4", "num_steps=5", "total_steps=40", "eval_episodes=2", "report=false", "cache=false")
