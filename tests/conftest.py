@@ -19,6 +19,16 @@ if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:  # as in the background of
 
 ROOT = Path(__file__).parent.parent
 
+SLOW = frozenset((ROOT / "tests" / "slow.txt").read_text(encoding="utf-8").split("\n"))
+
+
+@pytest.hookimpl(tryfirst=True)  # before the tests are chosen by their markers
+def pytest_collection_modifyitems(items):
+    """Marks as `study` what compiles for so long that the suite would take more than twenty minutes with it."""
+    for item in items:
+        if item.nodeid in SLOW:
+            item.add_marker(pytest.mark.study)
+
 
 @pytest.fixture(scope="session")
 def command_environment(tmp_path_factory):

@@ -124,6 +124,13 @@ def test_help_loads_nothing_heavy():
     assert not loaded & {"mujoco", "brax", "orbax", "matplotlib", "tensorboardX"}
 
 
+def test_a_stored_policy_is_read_without_what_trained_it():
+    loaded = loaded_by("import jaxpg.deploy.policy, jaxpg.store.policies, jaxpg.store.checkpoint")
+    training = {"losses", "estimators", "baselines", "learning", "actor_critic", "online", "shards"}
+    assert not loaded & {f"jaxpg.{name}" for name in training}
+    assert not loaded & {"jaxpg.program.compile", "jaxpg.program.algorithms", "optax"}
+
+
 def test_nothing_is_imported_before_it_is_needed():
     """Checkpoints, TensorBoard and pictures come while XLA compiles; the environment's physics when it is made."""
     loaded = loaded_by("from jaxpg.run import session")

@@ -119,8 +119,8 @@ def test_an_interrupt_that_is_to_be_ignored_stays_ignored_after_another_signal()
 COMPILING = """
 import jax, threading, time
 from concurrent.futures import ThreadPoolExecutor
-from jaxpg.run import program
-from jaxpg.errors import run_command
+from jaxpg.program import compile as program
+from jaxpg.commands.ending import run_command
 
 def main(arguments):
     with program._compilers() as pool:
