@@ -18,6 +18,7 @@ from jaxpg.program.algorithms import make_algorithm
 from jaxpg.program.compile import compile_program
 from jaxpg.program.environment import make_env
 from jaxpg.program.schedule import described_jump, plan
+from jaxpg.program.state import state_shape
 from jaxpg.run import session
 from jaxpg.run.chunks import PATIENCE, Watch
 from jaxpg.training import initial_state, train_chunk, train_scan
@@ -330,7 +331,7 @@ def _updates_of_agents(folder):
     from jaxpg.store.checkpoint import Checkpoints
 
     config = configured("num_seeds=2")
-    shape = program.state_shape(make_algorithm(config, make_env(config)), 2)
+    shape = state_shape(make_algorithm(config, make_env(config)), 2)
     checkpoints = Checkpoints(folder / "checkpoints", read_only=True)
     return np.asarray(checkpoints.restore(checkpoints.latest(), shape).train.update).tolist()
 

@@ -14,6 +14,7 @@ ROOT = Path(__file__).parent.parent
 LEVELS = [
     {
         "errors",
+        "posix",
         "types",
         "shapes",
         "returns",

@@ -180,10 +180,10 @@ def test_a_reset_that_is_not_finite_is_an_observation():
             return state.replace(obs=state.obs + jnp.nan)
 
     config = compose(["env=quadratic", "algo=td", "network=linear", "num_envs=4", "num_steps=2"])
-    from jaxpg.program import compile as program
+    from jaxpg.program import algorithms
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(program, "vectorize", lambda env, *sizes: vectorize(Born("obs", 0.0), *sizes))
+        patch.setattr(algorithms, "vectorize", lambda env, *sizes: vectorize(Born("obs", 0.0), *sizes))
         algorithm = make_algorithm(config, Born("obs", 0.0))
         _, metrics = train_scan(sound(algorithm), KEY, 1)
     assert quantities(metrics)[metrics["unsound"][0] - 1] == "observation"

@@ -8,7 +8,6 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import itertools
-import resource
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -18,6 +17,7 @@ import jax
 from jaxpg.config.configuration import Config, flatten
 from jaxpg.errors import UserError
 from jaxpg.features import num_features
+from jaxpg.posix import resource
 from jaxpg.program.mapping import groups_at_once
 from jaxpg.program.schedule import plan
 from jaxpg.types import PyTree

@@ -213,7 +213,7 @@ def _by_number(descriptor: int) -> Path:
 def _name(descriptor: int) -> Path:
     """The name that an open folder has now, as far as the system tells."""
     try:
-        from jaxpg.store.posix import fcntl  # at its use: options are read and --help is printed without it
+        from jaxpg.posix import fcntl  # at its use: options are read and --help is printed without it
 
         if hasattr(fcntl, "F_GETPATH"):
             return Path(os.fsdecode(fcntl.fcntl(descriptor, fcntl.F_GETPATH, bytes(1024)).rstrip(b"\0")))

@@ -14,8 +14,8 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 
 from jaxpg.errors import UserError
+from jaxpg.posix import fcntl
 from jaxpg.store import files
-from jaxpg.store.posix import fcntl
 
 NAME = "lock"
 LONGEST = 200  # bytes of an owner's name: what is in the file may be somebody else's words

@@ -1,4 +1,4 @@
-"""What runs need of the system, and Windows has not: locks on files, and names of open folders."""
+"""What runs need of the system, and Windows has not: locks on files, names of open folders, limits of memory."""
 
 from __future__ import annotations
 
@@ -6,7 +6,8 @@ from jaxpg.errors import UserError
 
 try:
     import fcntl
+    import resource
 except ImportError:
     raise UserError("runs need Linux or macOS; on Windows start this command in WSL, see docs/runs.md") from None
 
-__all__ = ["fcntl"]
+__all__ = ["fcntl", "resource"]
