@@ -1,9 +1,11 @@
 """Shared by all tests: strict JAX settings, a compilation cache for the session, and how commands are run."""
 
+import math
 import os
 import signal
 import subprocess
 import sys
+import time
 from pathlib import Path
 
 import jax
@@ -19,15 +21,31 @@ if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:  # as in the background of
 
 ROOT = Path(__file__).parent.parent
 
-SLOW = frozenset((ROOT / "tests" / "slow.txt").read_text(encoding="utf-8").split("\n"))
+SLOW = frozenset((ROOT / "tests" / "slow.txt").read_text(encoding="utf-8").split())  # tests, or all of a file
+BEGAN = time.monotonic()
 
 
-@pytest.hookimpl(tryfirst=True)  # before the tests are chosen by their markers
+def pytest_addoption(parser):
+    parser.addoption(
+        "--minutes", type=float, default=math.inf, help="slow tests that would begin after so many minutes are skipped"
+    )
+
+
+def is_slow(item):
+    """Whether the list has the test, whatever its parameters, or its file."""
+    path, _, name = item.nodeid.partition("::")
+    return bool({path, f"{path}::{name.partition('[')[0]}"} & SLOW)
+
+
 def pytest_collection_modifyitems(items):
-    """Marks as `study` what compiles for so long that the suite would take more than twenty minutes with it."""
-    for item in items:
-        if item.nodeid in SLOW:
-            item.add_marker(pytest.mark.study)
+    """The quick ones first: they are run on any machine."""
+    items.sort(key=is_slow)
+
+
+def pytest_runtest_setup(item):
+    """On a machine that is many times slower than usual a part of the slow tests has to do."""
+    if is_slow(item) and time.monotonic() - BEGAN > 60 * item.config.getoption("minutes"):
+        pytest.skip("slow, and the time given with --minutes is over")
 
 
 @pytest.fixture(scope="session")

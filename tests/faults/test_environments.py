@@ -234,7 +234,7 @@ def quick_to_compile(monkeypatch, tmp_path):
 def test_random_environments(number, capfd, tmp_path):
     counts, folders = {0: 0, 2: 0, 4: 0}, (tmp_path / f"run-{i}" for i in itertools.count())
 
-    @examples(number, 20 if number else 12)
+    @examples(number, 20 if number else 6)
     @given(descriptions())
     def attempt(about):
         note(f"python tests/faults/test_environments.py {shlex.quote(json.dumps(about))}")
