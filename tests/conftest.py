@@ -21,7 +21,7 @@ if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:  # as in the background of
 
 ROOT = Path(__file__).parent.parent
 
-SLOW = frozenset((ROOT / "tests" / "slow.txt").read_text(encoding="utf-8").split())  # tests, or all of a file
+SLOW = frozenset((ROOT / "tests" / "slow.txt").read_text(encoding="utf-8").split())  # files
 BEGAN = time.monotonic()
 
 
@@ -32,9 +32,7 @@ def pytest_addoption(parser):
 
 
 def is_slow(item):
-    """Whether the list has the test, whatever its parameters, or its file."""
-    path, _, name = item.nodeid.partition("::")
-    return bool({path, f"{path}::{name.partition('[')[0]}"} & SLOW)
+    return item.nodeid.partition("::")[0] in SLOW
 
 
 def pytest_collection_modifyitems(items):
