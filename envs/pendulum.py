@@ -34,7 +34,7 @@ class PendulumConfig:
     torque_limit: float = option(2.0, "largest torque, reached at |action| = 1 [N m]", above=0)
     speed_limit: float = option(8.0, "angular speed is clipped to this [rad/s]", above=0)
     dt: float = option(0.05, "time between two actions, one physics step [s]", above=0, at_most=1)
-    physics: str = option("scalar", "MJX's step as scalar equations or as it is, or C MuJoCo's", choices=PHYSICS)
+    physics: str = option("scalar", "MJX's step as scalar equations or as it is, or C MuJoCo's", choices=tuple(PHYSICS))
     episode_length: int = option(200, "steps until the time limit", at_least=1)
 
 

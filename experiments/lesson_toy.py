@@ -25,7 +25,8 @@ import numpy as np
 from commands import Parser, write_figure, write_json
 from matplotlib.figure import Figure
 
-from envs.quadratic import LinearQuadratic, Policy, QuadraticConfig, best_policy, chain, objective
+from envs.linear_quadratic import Policy, best_policy, objective
+from envs.quadratic import LinearQuadratic, QuadraticConfig, chain
 from jaxpg.commands.ending import run_command
 from jaxpg.config.parsing import compose
 from jaxpg.distributions import gaussian_log_prob, gaussian_sample

@@ -15,7 +15,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from envs.quadratic import Policy, Problem, Quadratic, backup, gradient, lambda_targets, values
+from envs.linear_quadratic import Policy, Problem, Quadratic, backup, gradient, lambda_targets, values
 from jaxpg import baselines, estimators
 from jaxpg.returns import discount_factors, discounted_returns
 
@@ -124,7 +124,7 @@ def flat(policy_like: Policy) -> np.ndarray:
 
 
 def closed_form(setting: Setting, following: list[Quadratic] | None = None, discounted: bool = True) -> np.ndarray:
-    """The gradient of J, or what `envs.quadratic.gradient` gives instead, as one vector."""
+    """The gradient of J, or what `envs.linear_quadratic.gradient` gives instead, as one vector."""
     return flat(gradient(setting.problem, setting.policy, following, discounted))
 
 

@@ -1,9 +1,9 @@
 """Policy gradients for robots as one XLA program.
 
-The equations are pure functions of arrays, to be imported one at a time:
+The equations are pure functions of arrays, in modules that are imported at their first use:
 
-    from jaxpg.returns import lambda_returns
-    from jaxpg.distributions import squashed_gaussian_log_prob
+    import jaxpg
+    jaxpg.returns.lambda_returns(reward, discount, next_value, lambda_=0.95)
 
 `python -m jaxpg.train env=pendulum` trains; `python -m jaxpg.evaluate run=DIR` evaluates; `jaxpg.load(DIR)` is the
 policy for a program of one's own.
@@ -11,7 +11,9 @@ policy for a program of one's own.
 
 from __future__ import annotations
 
+import importlib
 import os
+from types import ModuleType
 from typing import TYPE_CHECKING
 
 import jaxlib
@@ -22,8 +24,24 @@ check_jaxlib(jaxlib.__version__)
 
 __version__ = "0.1.0"
 
+MATHS = ("returns", "estimators", "baselines", "losses", "distributions", "features", "normalization")
+PROGRAMS = ("networks", "vector_env", "policy", "rollout", "methods", "updates", "actor_critic", "ppo", "online")
+LIBRARY = (*MATHS, *PROGRAMS, "training", "evaluation")
+
+__all__ = ["__version__", "load", *LIBRARY]
+
 if TYPE_CHECKING:
     from jaxpg.deploy.policy import Policy
+
+
+def __getattr__(name: str) -> ModuleType:
+    if name in LIBRARY:
+        return importlib.import_module(f"jaxpg.{name}")
+    raise AttributeError(f"module 'jaxpg' has no attribute '{name}'")
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *LIBRARY})
 
 
 def load(run: str | os.PathLike[str], checkpoint: str = "best", agent: int | None = None) -> Policy:

@@ -1,4 +1,4 @@
-"""Baselines: what is subtracted from a return without changing the mean of the gradient, to make it vary less.
+"""Baselines: what is subtracted from a return to make the gradient vary less without changing its mean.
 
     grad J = E[sum_t grad log pi(a_t | s_t) (G_t - b_t)]      for every b_t that does not depend on a_t
 
@@ -13,14 +13,22 @@
 N is the number of trajectories; the first three hold the trajectory's own return. All take returns `[T, N]`, time
 first, and give an array of that shape. A learned value is no function of returns: it comes from a network, and is
 free of bias as long as it was not fitted to the trajectories that it is subtracted from.
+
+`jaxpg.methods.reinforce` takes any `Baseline`. `critic` and `zero` are baselines as they are, `of_returns` and
+`of_scores` make one of the functions above.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import jax
 import jax.numpy as jnp
 
-from jaxpg.shapes import same, spread
+from jaxpg.shapes import broadcast_scalar, check_shape
+
+# baseline(returns, weight, value, squared_score) -> what is subtracted from the returns
+Baseline = Callable[[jax.Array, jax.Array, jax.Array, jax.Array], jax.Array | float]
 
 
 def batch_mean(returns: jax.Array, weight: jax.Array | float = 1.0) -> jax.Array:
@@ -44,7 +52,7 @@ def batch_mean(returns: jax.Array, weight: jax.Array | float = 1.0) -> jax.Array
     >>> batch_mean(jnp.array([3.0, 2.0])).tolist()
     [2.5, 2.5]
     """
-    weight = spread(weight, returns, "weight")
+    weight = broadcast_scalar(weight, returns, "weight")
     return jnp.broadcast_to(_ratio(jnp.sum(weight * returns), jnp.sum(weight)), returns.shape)
 
 
@@ -89,7 +97,7 @@ def leave_one_out(returns: jax.Array, weight: jax.Array | float = 1.0) -> jax.Ar
     """
     if returns.ndim != 2 or returns.shape[1] < 2:
         raise ValueError(f"returns have shape {returns.shape}, expected [T, N] with at least 2 trajectories")
-    weight = spread(weight, returns, "weight")
+    weight = broadcast_scalar(weight, returns, "weight")
     total, count = jnp.sum(weight * returns, axis=0), jnp.sum(weight, axis=0)
     return jnp.broadcast_to(_ratio(jnp.sum(total) - total, jnp.sum(count) - count), returns.shape)
 
@@ -115,10 +123,30 @@ def optimal(returns: jax.Array, squared_score: jax.Array, weight: jax.Array | fl
     >>> optimal(jnp.array([[1.0, 3.0]]), jnp.array([[3.0, 1.0]])).tolist()
     [[1.5, 1.5]]
     """
-    weight = spread(weight, returns, "weight") * same(squared_score, returns, "squared_score")
+    weight = broadcast_scalar(weight, returns, "weight") * check_shape(squared_score, returns, "squared_score")
     across = tuple(range(1, returns.ndim))
     total = jnp.sum(weight, axis=across, keepdims=True)
     return jnp.broadcast_to(_ratio(jnp.sum(weight * returns, axis=across, keepdims=True), total), returns.shape)
+
+
+def critic(returns: jax.Array, weight: jax.Array, value: jax.Array, squared_score: jax.Array) -> jax.Array:
+    """The critic's V(s_t)."""
+    return value
+
+
+def zero(returns: jax.Array, weight: jax.Array, value: jax.Array, squared_score: jax.Array) -> float:
+    """b_t = 0: the returns as they are."""
+    return 0.0
+
+
+def of_returns(function: Callable[[jax.Array, jax.Array], jax.Array]) -> Baseline:
+    """The baseline `function(returns, weight)`, such as `leave_one_out`."""
+    return lambda returns, weight, value, squared_score: function(returns, weight)
+
+
+def of_scores(function: Callable[[jax.Array, jax.Array, jax.Array], jax.Array]) -> Baseline:
+    """The baseline `function(returns, squared_score, weight)`, such as `optimal`."""
+    return lambda returns, weight, value, squared_score: function(returns, squared_score, weight)
 
 
 def _ratio(total: jax.Array, count: jax.Array) -> jax.Array:

@@ -43,6 +43,6 @@ def first_place(where: jax.Array, axis_name: str | None) -> jax.Array:
     return jnp.where(place == after_all, -1, place)
 
 
-def own(key: jax.Array, axis_name: str | None) -> jax.Array:
+def fold_in_index(key: jax.Array, axis_name: str | None) -> jax.Array:
     """A random key of this part's own, from one that all parts have."""
     return key if axis_name is None else jax.random.fold_in(key, jax.lax.axis_index(axis_name))

@@ -29,7 +29,7 @@ import jax.numpy as jnp
 
 from jaxpg import collectives
 from jaxpg.returns import discounted_returns, lambda_returns, n_step_returns, td_errors
-from jaxpg.shapes import floating, same, spread
+from jaxpg.shapes import broadcast_scalar, check_shape, floating
 
 
 class Estimate(NamedTuple):
@@ -65,7 +65,7 @@ def reinforce(reward: jax.Array, discount: jax.Array | float, baseline: jax.Arra
     [1.0, 0.0]
     """
     returns = discounted_returns(reward, discount, 0.0)
-    return Estimate(returns - spread(baseline, returns, "baseline"), returns)
+    return Estimate(returns - broadcast_scalar(baseline, returns, "baseline"), returns)
 
 
 def reinforce_whole(reward: jax.Array, discount: jax.Array | float, baseline: jax.Array | float = 0.0) -> Estimate:
@@ -92,7 +92,7 @@ def reinforce_whole(reward: jax.Array, discount: jax.Array | float, baseline: ja
     [1.75, 1.75, 1.75]
     """
     returns = discounted_returns(reward, discount, 0.0)
-    return Estimate(returns[0] - spread(baseline, returns, "baseline"), returns)
+    return Estimate(returns[0] - broadcast_scalar(baseline, returns, "baseline"), returns)
 
 
 def td_zero(reward: jax.Array, discount: jax.Array | float, value: jax.Array, next_value: jax.Array) -> Estimate:
@@ -147,7 +147,7 @@ def n_step(
     [8.0, 9.0, 8.0]
     """
     returns = n_step_returns(reward, discount, next_value, n, continues)
-    return Estimate(returns - same(value, returns, "value"), returns)
+    return Estimate(returns - check_shape(value, returns, "value"), returns)
 
 
 def td_lambda(
@@ -180,7 +180,7 @@ def td_lambda(
     [4.0, 2.0]
     """
     returns = lambda_returns(reward, discount, next_value, lambda_)
-    return Estimate(returns - same(value, returns, "value"), returns)
+    return Estimate(returns - check_shape(value, returns, "value"), returns)
 
 
 # estimate(reward, discount, value, next_value, continues) -> Estimate, of steps that may be cut
@@ -234,7 +234,7 @@ def normalize_advantages(
     [-1.0, 1.0]
     """
     advantage = floating(advantage)
-    weight = spread(weight, advantage, "weight")
+    weight = broadcast_scalar(weight, advantage, "weight")
     total = collectives.total(jnp.sum(weight), axis_name)
     total = jnp.where(total == 0, 1.0, total)  # nothing counts
     centred = advantage - collectives.total(jnp.sum(weight * advantage), axis_name) / total

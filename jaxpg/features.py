@@ -102,16 +102,3 @@ def radial(x: jax.Array, order: int) -> jax.Array:
         own = jax.nn.softmax(-(((x[..., i : i + 1] - axis) / width) ** 2) / 2, axis=-1)
         bumps = (bumps[..., :, None] * own[..., None, :]).reshape(*x.shape[:-1], -1)
     return bumps
-
-
-FEATURES = {"identity": identity, "polynomial": polynomial, "fourier": fourier, "radial": radial}
-
-
-def num_features(name: str, size: int, order: int) -> int:
-    """How many features `FEATURES[name]` makes of an observation of this size."""
-    return {
-        "identity": size,
-        "polynomial": math.comb(size + order, order) - 1,
-        "fourier": (order + 1) ** size - 1,
-        "radial": order**size,
-    }[name]

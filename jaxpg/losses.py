@@ -10,7 +10,7 @@ from __future__ import annotations
 import jax
 import jax.numpy as jnp
 
-from jaxpg.shapes import same, spread
+from jaxpg.shapes import broadcast_scalar, check_shape
 
 
 def policy_gradient_loss(log_prob: jax.Array, advantage: jax.Array, weight: jax.Array | float = 1.0) -> jax.Array:
@@ -32,8 +32,8 @@ def policy_gradient_loss(log_prob: jax.Array, advantage: jax.Array, weight: jax.
     >>> policy_gradient_loss(jnp.array([-1.0, -2.0]), jnp.array([1.0, 3.0])).item()
     3.5
     """
-    weight = spread(weight, log_prob, "weight")
-    return -jnp.mean(weight * log_prob * jax.lax.stop_gradient(same(advantage, log_prob, "advantage")))
+    weight = broadcast_scalar(weight, log_prob, "weight")
+    return -jnp.mean(weight * log_prob * jax.lax.stop_gradient(check_shape(advantage, log_prob, "advantage")))
 
 
 def clipped_surrogate_loss(
@@ -67,9 +67,9 @@ def clipped_surrogate_loss(
     >>> round(clipped_surrogate_loss(log_prob, jnp.zeros(2), advantage, clip=0.2).item(), 3)  # of -1.2 and 1.5
     0.15
     """
-    weight = spread(weight, log_prob, "weight")
-    advantage = jax.lax.stop_gradient(same(advantage, log_prob, "advantage"))
-    ratio = jnp.exp(log_prob - jax.lax.stop_gradient(same(old_log_prob, log_prob, "old_log_prob")))
+    weight = broadcast_scalar(weight, log_prob, "weight")
+    advantage = jax.lax.stop_gradient(check_shape(advantage, log_prob, "advantage"))
+    ratio = jnp.exp(log_prob - jax.lax.stop_gradient(check_shape(old_log_prob, log_prob, "old_log_prob")))
     gain = ratio * advantage
     if clip is not None:
         gain = jnp.minimum(gain, jnp.clip(ratio, 1 - clip, 1 + clip) * advantage)
@@ -96,8 +96,8 @@ def value_loss(value: jax.Array, target: jax.Array, weight: jax.Array | float = 
     >>> value_loss(jnp.array([1.0, 2.0]), jnp.array([0.0, 4.0])).item()
     1.25
     """
-    weight = spread(weight, value, "weight")
-    return 0.5 * jnp.mean(weight * (value - jax.lax.stop_gradient(same(target, value, "target"))) ** 2)
+    weight = broadcast_scalar(weight, value, "weight")
+    return 0.5 * jnp.mean(weight * (value - jax.lax.stop_gradient(check_shape(target, value, "target"))) ** 2)
 
 
 def clipped_value_loss(
@@ -122,9 +122,9 @@ def clipped_value_loss(
     >>> clipped_value_loss(jnp.array([3.0]), jnp.array([0.0]), jnp.array([3.0]), clip=1.0).item()
     2.0
     """
-    weight = spread(weight, value, "weight")
-    target = jax.lax.stop_gradient(same(target, value, "target"))
-    old_value = jax.lax.stop_gradient(same(old_value, value, "old_value"))
+    weight = broadcast_scalar(weight, value, "weight")
+    target = jax.lax.stop_gradient(check_shape(target, value, "target"))
+    old_value = jax.lax.stop_gradient(check_shape(old_value, value, "old_value"))
     held = old_value + jnp.clip(value - old_value, -clip, clip)
     return 0.5 * jnp.mean(weight * jnp.maximum((value - target) ** 2, (held - target) ** 2))
 
@@ -146,4 +146,4 @@ def entropy_loss(entropy: jax.Array, weight: jax.Array | float = 1.0) -> jax.Arr
     >>> entropy_loss(jnp.array([1.0, 3.0])).item()
     -2.0
     """
-    return -jnp.mean(spread(weight, entropy, "weight") * entropy)
+    return -jnp.mean(broadcast_scalar(weight, entropy, "weight") * entropy)

@@ -10,12 +10,9 @@ import jax.numpy as jnp
 from flax import linen as nn
 
 from jaxpg.distributions import SQUASHED_GAUSSIAN, Distribution
-from jaxpg.features import FEATURES
+from jaxpg.features import identity
 from jaxpg.types import PyTree
 
-ACTIVATIONS = {"tanh": jnp.tanh, "relu": jax.nn.relu, "elu": jax.nn.elu, "swish": jax.nn.swish}
-# A constant; a parameter that learns; one that the optimizer takes to a given value; a function of the state.
-SIGMAS = ("fixed", "learned", "scheduled", "state")
 # A sigma that depends on the state stays within e^-3 and e^3 times its initial value: without bounds the states that
 # are seldom visited get any sigma, and some seeds of the pendulum end at 10^5.
 SIGMA_RANGE = 3.0
@@ -87,46 +84,78 @@ def _orthonormalize(a: jax.Array) -> jax.Array:
     return jax.lax.scan(step, jnp.zeros_like(a), jnp.arange(a.shape[1]))[0]
 
 
+# log_std(actor, obs) -> log sigma, `[action_size]` or `[N, action_size]`, called in the actor's own scope
+Sigma = Callable[["GaussianActor", jax.Array], jax.Array]
+
+
+def fixed(std: float) -> Sigma:
+    """Sigma is `std`, and no parameter."""
+
+    def log_std(actor, obs):
+        return _log_constant(std)(None, (actor.action_size,))
+
+    return log_std
+
+
+def learned(std: float) -> Sigma:
+    """Sigma is a parameter, at first `std`. An optimizer may also lead it along a schedule."""
+
+    def log_std(actor, obs):
+        return actor.param("log_std", _log_constant(std), (actor.action_size,))
+
+    return log_std
+
+
+def state_dependent(std: float) -> Sigma:
+    """Sigma is a function of the observation, by a network like the mean's.
+
+        log(sigma / std) = R tanh(x / R),    R = `SIGMA_RANGE`
+
+    with x the network's output, 0 or nearly so at first.
+    """
+
+    def log_std(actor, obs):
+        x = actor.make_mlp()(obs)
+        return _log_constant(std)(None, (actor.action_size,)) + SIGMA_RANGE * jnp.tanh(x / SIGMA_RANGE)
+
+    return log_std
+
+
+def _log_constant(std: float) -> nn.initializers.Initializer:
+    return nn.initializers.constant(jnp.log(std))
+
+
 class GaussianActor(nn.Module):
     """u ~ N(mu(s), sigma^2), with an MLP for the mean and one sigma for each action.
 
     Attributes:
       widths, action_size, activation: of the MLP; without hidden layers the mean is linear.
       output_gain: of the mean's last layer; 0 begins with the mean 0 everywhere.
-      initial_std: sigma at the beginning; with sigma "state" it is so where the network's output x is 0, and
-        log(sigma / initial_std) = R tanh(x / R), R = `SIGMA_RANGE`.
-      sigma: a name in `SIGMAS`.
+      sigma: `fixed(std)`, `learned(std)` or `state_dependent(std)`.
     """
 
     widths: Sequence[int]
     action_size: int
     activation: Callable[[jax.Array], jax.Array]
     output_gain: float
-    initial_std: float
-    sigma: str
+    sigma: Sigma
 
     @nn.compact
     def __call__(self, obs: jax.Array) -> tuple[jax.Array, jax.Array]:
-        mean = MLP(self.widths, self.action_size, self.output_gain, self.activation)(obs)
-        initial = nn.initializers.constant(jnp.log(self.initial_std))
-        if self.sigma == "state":
-            offset = MLP(self.widths, self.action_size, self.output_gain, self.activation)(obs)
-            offset = SIGMA_RANGE * jnp.tanh(offset / SIGMA_RANGE)
-            return mean, initial(None, (self.action_size,)) + offset
-        if self.sigma in ("learned", "scheduled"):
-            return mean, self.param("log_std", initial, (self.action_size,))
-        return mean, initial(None, (self.action_size,))
+        return self.make_mlp()(obs), self.sigma(self, obs)
+
+    def make_mlp(self) -> MLP:
+        """A network of the actor's sizes; it belongs to the actor whose `__call__` asks for it."""
+        return MLP(self.widths, self.action_size, self.output_gain, self.activation)
 
 
 def mlp_networks(
     observation_size: int,
     action_size: int,
     widths: Sequence[int] = (64, 64),
-    activation: str = "tanh",
-    features: str = "identity",
-    order: int = 1,
-    initial_std: float = 1.0,
-    sigma: str = "learned",
+    activation: Callable[[jax.Array], jax.Array] = jnp.tanh,
+    features: Callable[[jax.Array], jax.Array] = identity,
+    sigma: Sigma = learned(1.0),
     distribution: Distribution = SQUASHED_GAUSSIAN,
 ) -> Networks:
     """Separate MLPs for the mean of the policy and for the value.
@@ -136,12 +165,10 @@ def mlp_networks(
     Args:
       observation_size, action_size: of the environment.
       widths: hidden units by layer, the same for actor and critic.
-      activation: a name in `ACTIVATIONS`.
-      features, order: phi, a name in `jaxpg.features.FEATURES` and its order. With the products of two observations an
-        energy, say, is linear in what the first layer sees.
-      initial_std: sigma of the Gaussian over u; positive.
-      sigma: a name in `SIGMAS`: as it is, a parameter, or the output of an MLP of its own. "scheduled" is a parameter
-        like "learned"; that it follows a schedule is the optimizer's doing.
+      activation: of the hidden layers.
+      features: phi, one of `jaxpg.features` at a given order. With the products of two observations an energy, say, is
+        linear in what the first layer sees.
+      sigma: of the Gaussian over u: `fixed(std)`, `learned(std)` or `state_dependent(std)`.
       distribution: what is made of u.
 
     >>> networks = mlp_networks(observation_size=3, action_size=1)
@@ -150,19 +177,16 @@ def mlp_networks(
     >>> mean.shape, log_std.shape, networks.value(params["critic"], jnp.zeros((5, 3))).shape
     ((5, 1), (1,), (5,))
     """
-    activation = ACTIVATIONS[activation]
-    actor = GaussianActor(tuple(widths), action_size, activation, 0.01, initial_std, sigma)
+    actor = GaussianActor(tuple(widths), action_size, activation, 0.01, sigma)
     critic = MLP(tuple(widths), 1, output_gain=1.0, activation=activation)
-    return _networks(actor, critic, lambda obs: FEATURES[features](obs, order), observation_size, distribution)
+    return _networks(actor, critic, features, observation_size, distribution)
 
 
 def linear_networks(
     observation_size: int,
     action_size: int,
-    features: str = "identity",
-    order: int = 1,
-    initial_std: float = 1.0,
-    sigma: str = "learned",
+    features: Callable[[jax.Array], jax.Array] = identity,
+    sigma: Sigma = learned(1.0),
     distribution: Distribution = SQUASHED_GAUSSIAN,
 ) -> Networks:
     """Mean and value linear in fixed features of the observation, 0 at the beginning.
@@ -171,18 +195,20 @@ def linear_networks(
 
     Args:
       observation_size, action_size: of the environment.
-      features, order: phi, a name in `jaxpg.features.FEATURES` and its order.
-      initial_std, sigma, distribution: as in `mlp_networks`; with sigma "state", x is linear in phi too.
+      features: phi, one of `jaxpg.features` at a given order.
+      sigma, distribution: as in `mlp_networks`; a `state_dependent` sigma is linear in phi too, within its bounds.
 
     Source: the lesson, section 7.
 
-    >>> networks = linear_networks(observation_size=2, action_size=1, features="polynomial", order=2)
+    >>> from functools import partial
+    >>> from jaxpg.features import polynomial
+    >>> networks = linear_networks(observation_size=2, action_size=1, features=partial(polynomial, order=2))
     >>> jax.tree.map(jnp.shape, networks.init(jax.random.key(0))["critic"])
     {'params': {'Dense_0': {'bias': (1,), 'kernel': (5, 1)}}}
     """
-    actor = GaussianActor((), action_size, jnp.tanh, 0.0, initial_std, sigma)
+    actor = GaussianActor((), action_size, jnp.tanh, 0.0, sigma)
     critic = MLP((), 1, output_gain=0.0, activation=jnp.tanh)
-    return _networks(actor, critic, lambda obs: FEATURES[features](obs, order), observation_size, distribution)
+    return _networks(actor, critic, features, observation_size, distribution)
 
 
 def linear_mean(actor: PyTree) -> tuple[jax.Array, jax.Array]:

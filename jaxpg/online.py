@@ -12,11 +12,12 @@ import jax
 import jax.numpy as jnp
 
 from jaxpg import divergence, normalization
-from jaxpg.actor_critic import harmless, sampling_policy
+from jaxpg.batch import neutralize
 from jaxpg.networks import Networks
+from jaxpg.policy import sampling_policy
 from jaxpg.returns import td_errors
 from jaxpg.rollout import rollout
-from jaxpg.shapes import along, select
+from jaxpg.shapes import expand_like, select
 from jaxpg.types import Algorithm, Metrics, PyTree, TrainState, Transition
 from jaxpg.vector_env import VectorEnv, episode_metrics, stagger
 
@@ -143,7 +144,7 @@ def trace_update(
 
     def update(params, traces, normalizer, transition, counts=True):
         counts = jnp.broadcast_to(counts, transition.reward.shape)
-        transition = harmless(transition, counts, normalizer)
+        transition = neutralize(transition, counts, normalizer)
         obs = normalization.normalize(normalizer, transition.obs)
         next_obs = normalization.normalize(normalizer, transition.next_obs)
         value, value_gradient = _each(jax.value_and_grad(networks.value))(params["critic"], obs)
@@ -154,13 +155,15 @@ def trace_update(
         next_value = networks.value(params["critic"], next_obs)
         delta = jnp.where(counts, td_errors(reward_scale * transition.reward, discount, value, next_value), 0.0)
         z_critic = jax.tree.map(lambda z, g: gamma * lambda_critic * z + g, traces.critic, value_gradient)
-        z_actor = jax.tree.map(lambda z, g: gamma * lambda_actor * z + along(traces.factor, g) * g, traces.actor, score)
+        z_actor = jax.tree.map(
+            lambda z, g: gamma * lambda_actor * z + expand_like(traces.factor, g) * g, traces.actor, score
+        )
         params = {
             "actor": _ascend(params["actor"], actor_lr, delta, z_actor),
             "critic": _ascend(params["critic"], critic_lr, delta, z_critic),
         }
         goes_on = 1 - jnp.maximum(transition.terminated, transition.truncated)
-        z_actor, z_critic = jax.tree.map(lambda z: along(goes_on, z) * z, (z_actor, z_critic))
+        z_actor, z_critic = jax.tree.map(lambda z: expand_like(goes_on, z) * z, (z_actor, z_critic))
         factor = jnp.where(goes_on > 0, (gamma if discounted else 1.0) * traces.factor, 1.0)
         metrics = {"td_error": jnp.mean(jnp.abs(delta)), "value": jnp.mean(value), "sigma": jnp.mean(sigma)}
         return params, Traces(z_actor, z_critic, factor), metrics
@@ -180,7 +183,7 @@ def learnable(transition: Transition, normalizer: PyTree, normalized: bool) -> j
 
 def _ascend(params: PyTree, step_size: float, delta: jax.Array, traces: PyTree) -> PyTree:
     """params + step_size delta z, the mean over the environments."""
-    return jax.tree.map(lambda x, z: x + step_size * jnp.mean(along(delta, z) * z, axis=0), params, traces)
+    return jax.tree.map(lambda x, z: x + step_size * jnp.mean(expand_like(delta, z) * z, axis=0), params, traces)
 
 
 def _each(function):

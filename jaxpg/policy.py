@@ -7,9 +7,13 @@ from collections.abc import Callable
 import jax
 
 from jaxpg import normalization
+from jaxpg.distributions import gaussian_sample
 from jaxpg.networks import Networks
 from jaxpg.normalization import RunningStatistics
 from jaxpg.types import PyTree
+
+# policy_fn(obs [N, observation_size], key) -> (u, action), both [N, action_size]
+PolicyFn = Callable[[jax.Array, jax.Array], tuple[jax.Array, jax.Array]]
 
 
 def deterministic_policy(
@@ -22,6 +26,17 @@ def deterministic_policy(
         return networks.distribution.action(mean)
 
     return policy
+
+
+def sampling_policy(networks: Networks, params: PyTree, normalizer: PyTree) -> PolicyFn:
+    """`policy_fn(obs, key) -> (u, action)`, drawn from the Gaussian."""
+
+    def policy_fn(obs, key):
+        mean, log_std = networks.policy(params["actor"], normalization.normalize(normalizer, obs))
+        u = gaussian_sample(key, mean, log_std)
+        return u, networks.distribution.action(u)
+
+    return policy_fn
 
 
 def value_function(

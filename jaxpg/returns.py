@@ -10,7 +10,7 @@ from __future__ import annotations
 import jax
 import jax.numpy as jnp
 
-from jaxpg.shapes import floating, spread
+from jaxpg.shapes import broadcast_scalar, floating
 
 
 def discounted_returns(reward: jax.Array, discount: jax.Array | float, bootstrap: jax.Array | float) -> jax.Array:
@@ -35,8 +35,8 @@ def discounted_returns(reward: jax.Array, discount: jax.Array | float, bootstrap
     [2.75, 3.5, 5.0]
     """
     reward = floating(reward)
-    discount = spread(discount, reward, "discount")
-    bootstrap = spread(bootstrap, reward[0], "bootstrap")
+    discount = broadcast_scalar(discount, reward, "discount")
+    bootstrap = broadcast_scalar(bootstrap, reward[0], "bootstrap")
     return _backward(reward, discount, bootstrap)
 
 
@@ -86,8 +86,12 @@ def td_errors(reward: jax.Array, discount: jax.Array | float, value: jax.Array, 
     [1.0]
     """
     reward = floating(reward)
-    discount = spread(discount, reward, "discount")
-    return reward + discount * spread(next_value, reward, "next_value") - spread(value, reward, "value")
+    discount = broadcast_scalar(discount, reward, "discount")
+    return (
+        reward
+        + discount * broadcast_scalar(next_value, reward, "next_value")
+        - broadcast_scalar(value, reward, "value")
+    )
 
 
 def n_step_returns(
@@ -125,9 +129,9 @@ def n_step_returns(
     if n < 1:
         raise ValueError(f"n must be at least 1, got {n}")
     reward = floating(reward)
-    discount = spread(discount, reward, "discount")
-    next_value = spread(next_value, reward, "next_value")
-    continues = spread(continues, reward, "continues")
+    discount = broadcast_scalar(discount, reward, "discount")
+    next_value = broadcast_scalar(next_value, reward, "next_value")
+    continues = broadcast_scalar(continues, reward, "continues")
     returns = reward + discount * next_value
     for _ in range(min(n, len(reward)) - 1):
         following = jnp.concatenate([returns[1:], next_value[-1:]])
@@ -167,9 +171,9 @@ def lambda_returns(
     [3.25, 5.0]
     """
     reward = floating(reward)
-    discount = spread(discount, reward, "discount")
-    next_value = spread(next_value, reward, "next_value")
-    lambda_ = spread(lambda_, reward, "lambda_")
+    discount = broadcast_scalar(discount, reward, "discount")
+    next_value = broadcast_scalar(next_value, reward, "next_value")
+    lambda_ = broadcast_scalar(lambda_, reward, "lambda_")
     return _backward(reward + discount * (1 - lambda_) * next_value, discount * lambda_, next_value[-1])
 
 

@@ -7,10 +7,8 @@ from typing import Any
 
 import jax
 
+from jaxpg.policy import PolicyFn
 from jaxpg.types import Transition
-
-# obs [N, observation_size], key -> (u, action), both [N, action_size]
-PolicyFn = Callable[[jax.Array, jax.Array], tuple[jax.Array, jax.Array]]
 
 
 def rollout(

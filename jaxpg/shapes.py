@@ -16,7 +16,7 @@ def floating(x: jax.Array) -> jax.Array:
     return jnp.asarray(x, jnp.result_type(x, 0.0))
 
 
-def spread(x: jax.Array | float, reference: jax.Array, name: str) -> jax.Array:
+def broadcast_scalar(x: jax.Array | float, reference: jax.Array, name: str) -> jax.Array:
     """`x` in the reference's shape and type.
 
     Args:
@@ -27,7 +27,7 @@ def spread(x: jax.Array | float, reference: jax.Array, name: str) -> jax.Array:
     Raises:
       ValueError: x has another shape.
 
-    >>> spread(0.5, jnp.ones(2), "discount").tolist()
+    >>> broadcast_scalar(0.5, jnp.ones(2), "discount").tolist()
     [0.5, 0.5]
     """
     x = jnp.asarray(x, reference.dtype)
@@ -36,10 +36,10 @@ def spread(x: jax.Array | float, reference: jax.Array, name: str) -> jax.Array:
     return jnp.broadcast_to(x, reference.shape)
 
 
-def along(x: jax.Array, reference: jax.Array) -> jax.Array:
+def expand_like(x: jax.Array, reference: jax.Array) -> jax.Array:
     """`x`, `[N]`, with as many axes as the reference, `[N, ...]`: one number for each of its rows.
 
-    >>> along(jnp.ones(3), jnp.ones((3, 2, 4))).shape
+    >>> expand_like(jnp.ones(3), jnp.ones((3, 2, 4))).shape
     (3, 1, 1)
     """
     return x.reshape(x.shape + (1,) * (reference.ndim - 1))
@@ -60,7 +60,7 @@ def select(mask: jax.Array, if_true: Any, if_false: Any) -> Any:
     return jax.tree.map(rows, if_true, if_false)
 
 
-def same(x: jax.Array, reference: jax.Array, name: str) -> jax.Array:
+def check_shape(x: jax.Array, reference: jax.Array, name: str) -> jax.Array:
     """`x`, which must have the reference's shape; raises ValueError where it has another."""
     if x.shape != reference.shape:
         raise ValueError(f"{name} has shape {x.shape}, expected {reference.shape}")

@@ -11,21 +11,15 @@ from probes import Constant, Counter, Target
 
 from envs.base import State
 from jaxpg import normalization
-from jaxpg.actor_critic import (
-    Method,
-    actor_critic,
-    batch_of,
-    critic,
-    no_baseline,
-    reinforce,
-    sampling_policy,
-    td,
-)
+from jaxpg.actor_critic import actor_critic
+from jaxpg.baselines import critic, zero
+from jaxpg.batch import batch_fn
 from jaxpg.estimators import gae, td_lambda
 from jaxpg.evaluation import evaluate
-from jaxpg.learning import Reuse
+from jaxpg.methods import Method, reinforce, td
 from jaxpg.networks import mlp_networks
-from jaxpg.policy import deterministic_policy
+from jaxpg.policy import deterministic_policy, sampling_policy
+from jaxpg.ppo import ppo
 from jaxpg.program.algorithms import BASELINES
 from jaxpg.training import initial_state, train_scan
 from jaxpg.vector_env import vectorize
@@ -36,10 +30,12 @@ def new_key(seed=0):
     return jax.random.key(seed)
 
 
-def make(env, method, num_envs=8, episode_length=10, learning_rate=3e-3, widths=(8,), **options):
+def make(
+    env, method, num_envs=8, episode_length=10, learning_rate=3e-3, widths=(8,), algorithm=actor_critic, **options
+):
     networks = mlp_networks(env.observation_size, env.action_size, widths)
     optimizer = optax.adam(learning_rate)
-    return networks, actor_critic(vectorize(env, num_envs, episode_length), networks, optimizer, method, **options)
+    return networks, algorithm(vectorize(env, num_envs, episode_length), networks, optimizer, method, **options)
 
 
 def learned_value(method, gamma=0.9):
@@ -110,10 +106,10 @@ def test_lambda_sum_stops_at_the_time_limit():
 def test_reinforce_returns_are_those_of_whole_episodes():
     """Reward 1 and death after 3 steps: G = 3, 2, 1, and what follows the end has weight 0."""
     env = Counter(life=3)
-    networks, _ = make(env, reinforce(1.0, no_baseline))
+    networks, _ = make(env, reinforce(1.0, zero))
     vector = vectorize(env, 4, 5)
     policy_fn = sampling_policy(networks, networks.init(new_key()), normalization.init(2))
-    method = reinforce(1.0, no_baseline)
+    method = reinforce(1.0, zero)
     _, steps = method.collect(vector, policy_fn, vector.reset(new_key()), jax.random.key(1))
     weight = method.weight(steps)
     np.testing.assert_array_equal(weight[:, 0], [1, 1, 1, 0, 0])
@@ -205,10 +201,10 @@ def test_policy_is_not_moved_by_the_critics_error():
 def test_one_unclipped_step_of_ppo_is_td():
     """The surrogate's gradient at a ratio of 1 is the policy gradient; to rounding of the ratio."""
     _, once = make(Counter(), td(0.9, 4, gae(0.95)))
-    _, reused = make(Counter(), td(0.9, 4, gae(0.95)), reuse=Reuse(epochs=1, minibatches=1, clip=None))
+    _, reused = make(Counter(), td(0.9, 4, gae(0.95)), algorithm=ppo, epochs=1, clip=None)
     left, right = (jax.jit(lambda key, a=a: train_scan(a, key, 20))(new_key())[0] for a in (once, reused))
     jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-4, atol=1e-6), left.params, right.params)
-    _, again = make(Counter(), td(0.9, 4, gae(0.95)), reuse=Reuse(epochs=2, minibatches=1, clip=None))
+    _, again = make(Counter(), td(0.9, 4, gae(0.95)), algorithm=ppo, epochs=2, clip=None)
     other, _ = jax.jit(lambda key: train_scan(again, key, 20))(new_key())
     assert max(abs(a - b).max() for a, b in zip(*map(jax.tree.leaves, (left.params, other.params)), strict=True)) > 1e-3
 
@@ -221,7 +217,7 @@ def test_advantages_are_of_the_values_of_both_normalized_observations(limit):
     statistics = normalization.update(normalization.init(2), jnp.array([[1.0, 2.0], [4.0, -3.0]]))
     method, policy_fn = td(0.9, 5, gae(0.0)), sampling_policy(networks, params, statistics)
     _, steps = method.collect(vector, policy_fn, method.start(vector, new_key()), jax.random.key(1))
-    batch = batch_of(networks, method, limit, 2.0, False)(params, statistics, steps)
+    batch = batch_fn(networks, method, limit, 2.0, False)(params, statistics, steps)
     value, next_value = (
         networks.value(params["critic"], normalization.normalize(statistics, x)) for x in (steps.obs, steps.next_obs)
     )
@@ -239,7 +235,9 @@ def test_finds_the_best_action_from_few_rollouts():
         num_envs=64,
         episode_length=2,
         learning_rate=1e-2,
-        reuse=Reuse(10, 2, max_kl=0.1),
+        algorithm=ppo,
+        minibatches=2,
+        max_kl=0.1,
     )
     state, _ = jax.jit(lambda key: train_scan(algorithm, key, 40))(new_key())
     act = deterministic_policy(networks, state.params, state.normalizer)

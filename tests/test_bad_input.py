@@ -93,7 +93,7 @@ MISTAKES = {
     "fraction for a seed": (["seed=1.5"], "seed=1.5: expected a whole number"),
     "switch for a seed": (["seed=true"], "seed=True: expected a whole number"),
     "nothing for a seed": (["seed="], "seed=: expected a whole number"),
-    "digits of another script": (["seed=\u0663"], "expected name=value, such as seed=3"),
+    "digits of another script": (["seed=\u0663"], "seed=\u0663: expected a whole number"),
     "rollout beyond 32 bits": (
         ["num_envs=100000000", "num_steps=30"],
         "num_envs=100000000 num_steps=30: their product must stay below 2**31",
@@ -150,7 +150,7 @@ MISTAKES = {
     "no equals sign": (["seed"], "'seed': expected name=value"),
     "stray flag": (["--fast"], "'--fast': expected name=value"),
     "unbalanced bracket": (["network.widths=[64"], "expected name=value"),
-    "values without a list": (["seed=1,2"], "expected name=value"),
+    "values without a list": (["seed=1,2"], "seed=1,2: expected a whole number"),
     "given twice": (["seed=1", "seed=2"], "seed is given twice"),
     "no run folder to resume": (
         ["resume=/nowhere/at/all"],

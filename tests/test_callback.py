@@ -19,8 +19,9 @@ import envs
 from envs.physics import PHYSICS, MujocoModelError, compile_step
 from envs.physics.callback import Simulations
 from envs.physics.fields import INPUTS, OUTPUTS, types_of
-from jaxpg.actor_critic import actor_critic, td
+from jaxpg.actor_critic import actor_critic
 from jaxpg.estimators import gae
+from jaxpg.methods import td
 from jaxpg.networks import mlp_networks
 from jaxpg.shards import AXIS, sharded
 from jaxpg.training import train_scan

@@ -1,5 +1,6 @@
 """Physics that diverges: when that is, and that nothing is learned from it."""
 
+from functools import partial
 from typing import NamedTuple
 
 import jax
@@ -12,13 +13,15 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from envs.base import State
-from jaxpg.actor_critic import actor_critic, of_returns, reinforce, td
-from jaxpg.baselines import leave_one_out
+from jaxpg.actor_critic import actor_critic
+from jaxpg.baselines import leave_one_out, of_returns
 from jaxpg.divergence import BOUND, diverged, lasting
 from jaxpg.estimators import gae
-from jaxpg.learning import Reuse
+from jaxpg.features import polynomial
+from jaxpg.methods import reinforce, td
 from jaxpg.networks import linear_networks, mlp_networks
 from jaxpg.online import online_actor_critic
+from jaxpg.ppo import ppo
 from jaxpg.rollout import rollout
 from jaxpg.training import initial_state, train_scan
 from jaxpg.vector_env import episode_metrics, vectorize
@@ -151,7 +154,7 @@ class Path(Servo):
 
 NETWORKS = {
     "mlp": mlp_networks(1, 1, (8,)),
-    "polynomial": linear_networks(1, 1, features="polynomial", order=5),
+    "polynomial": linear_networks(1, 1, features=partial(polynomial, order=5)),
 }
 STEPS = 9  # three explosions in a rollout, and the last is complete
 SHARED = {"gamma": 0.9, "lambda_actor": 0.7, "lambda_critic": 0.4, "actor_lr": 1e-3, "critic_lr": 5e-3}
@@ -161,9 +164,10 @@ def algorithm(name, env, networks="mlp", num_envs=12, episode_length=STEPS, **op
     networks, batch = NETWORKS[networks], vectorize(env, num_envs, episode_length)
     if name == "online":
         return online_actor_critic(batch, networks, num_steps=STEPS, **SHARED, **options)
-    reuse = Reuse(epochs=2, minibatches=2) if name == "ppo" else None
     method = reinforce(0.9, of_returns(leave_one_out)) if name == "reinforce" else td(0.9, STEPS, gae(0.9))
-    return actor_critic(batch, networks, optax.adam(1e-2), method, reuse=reuse, **options)
+    if name == "ppo":
+        return ppo(batch, networks, optax.adam(1e-2), method, epochs=2, minibatches=2, **options)
+    return actor_critic(batch, networks, optax.adam(1e-2), method, **options)
 
 
 ALGORITHMS = ("td", "ppo", "reinforce", "online")

@@ -243,7 +243,7 @@ def test_updates_that_are_left_out_hold_no_schedule_up(tmp_path, exploding_at):
     config = configured(*SCHEDULED, "nan_policy=skip")
     compiled = compile_program(config, make_env(config), chunk=UPDATES)
     train_state, metrics = compiled.advance(compiled.init().train)
-    assert (metrics["unsound"] > 0).sum() == 3
+    assert (metrics["nonfinite"] > 0).sum() == 3
     found = float(np.exp(np.asarray(train_state.params["actor"]["params"]["log_std"])[0, 0]))
     np.testing.assert_allclose(found, 0.05, rtol=1e-5)
 
@@ -342,7 +342,7 @@ def looked(policy, *rows, patience=PATIENCE):
     for row in rows:
         unsound = np.broadcast_to(np.asarray(row, int), (2, np.shape(row)[-1]))
         nothing = np.zeros(unsound.shape)
-        metrics = {"unsound": unsound, "unsound_env": nothing - 1, "diverged": nothing, "value_loss": nothing}
+        metrics = {"nonfinite": unsound, "nonfinite_env": nothing - 1, "diverged": nothing, "value_loss": nothing}
         watch.look(TrainState(None, None, None, None, np.zeros(2, int)), metrics)
     return watch.nobody_goes_on
 

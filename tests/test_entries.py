@@ -8,14 +8,16 @@ from in_process import ended
 
 from envs.options import option
 from jaxpg import evaluate, export, train
-from jaxpg.actor_critic import actor_critic, td
+from jaxpg.actor_critic import actor_critic
 from jaxpg.config import schema
-from jaxpg.config.schema import ALGORITHMS, NETWORKS, Common, Entry, Gaussian, number
+from jaxpg.config.entries import ALGORITHMS, NETWORKS, Entry
+from jaxpg.config.schema import Common, Gaussian, number
 from jaxpg.distributions import GAUSSIAN, SQUASHED_GAUSSIAN
+from jaxpg.methods import td
 from jaxpg.networks import mlp_networks
-from jaxpg.program import algorithms
+from jaxpg.program import algorithms, networks
+from jaxpg.program.compile import NAN_POLICIES
 from jaxpg.program.networks import make_networks
-from jaxpg.soundness import POLICIES
 from jaxpg.store.loggers import SERVICES
 from jaxpg.vector_env import vectorize
 
@@ -75,4 +77,7 @@ def test_names_of_options_are_those_of_the_functions():
     assert tuple(algorithms.BASELINES) == schema.BASELINES
     assert tuple(algorithms.RETURNS) == schema.RETURNS
     assert tuple(SERVICES) == schema.LOGGERS
-    assert schema.NAN_POLICIES == POLICIES
+    assert tuple(NAN_POLICIES) == schema.NAN_POLICIES
+    assert tuple(networks.ACTIVATIONS) == schema.ACTIVATIONS
+    assert schema.FEATURES == tuple(networks.FEATURES) == tuple(networks.NUM_FEATURES)
+    assert tuple(networks.SIGMAS) == schema.SIGMAS

@@ -14,12 +14,11 @@ from stored import a_policy
 from jaxpg import evaluate
 from jaxpg import export as command_line
 from jaxpg.config.parsing import compose
+from jaxpg.config.schema import ACTIVATIONS, FEATURES
 from jaxpg.deploy import c, header, learning, onnx, reference, stablehlo
 from jaxpg.deploy.controller import commanding, controller, observations
 from jaxpg.deploy.export import FORMATS, TOLERANCE, trial
 from jaxpg.errors import UserError
-from jaxpg.features import FEATURES
-from jaxpg.networks import ACTIVATIONS
 from jaxpg.program.networks import make_networks
 from jaxpg.types import Transition
 

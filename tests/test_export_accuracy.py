@@ -14,12 +14,11 @@ from stored import a_policy
 from envs.base import Interface, initial_state
 from jaxpg import export as command_line
 from jaxpg import normalization
+from jaxpg.config.schema import ACTIVATIONS, FEATURES
 from jaxpg.deploy import header, online, reference
 from jaxpg.deploy.controller import controller, observations, played
 from jaxpg.deploy.export import FORMATS, TOLERANCE, trial
 from jaxpg.errors import UserError
-from jaxpg.features import FEATURES
-from jaxpg.networks import ACTIVATIONS
 from jaxpg.normalization import RunningStatistics
 
 # --- the reference: by loops over single numbers ----------------------------------------------------------------------

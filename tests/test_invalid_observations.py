@@ -8,11 +8,10 @@ import numpy as np
 import pytest
 from stored import a_policy
 
+from jaxpg.config.schema import ACTIVATIONS, FEATURES
 from jaxpg.deploy import c
 from jaxpg.deploy.controller import commanding, controller
 from jaxpg.deploy.export import FORMATS
-from jaxpg.features import FEATURES
-from jaxpg.networks import ACTIVATIONS
 from jaxpg.normalization import RunningStatistics
 
 INVALID = (np.nan, np.inf, -np.inf, 1e30, -3e38)

@@ -77,7 +77,7 @@ def advantages(*options):
     zero = jnp.zeros((8, 3))
     steps = Transition(zero, zero, reward, zero, zero.at[3, 0].set(1.0), zero, zero, zero, zero)
     config = configured(*options)
-    method = {"td": td_method, "reinforce": reinforce_method}[config.choices["algo"]](config)
+    method = (reinforce_method if config.choices["algo"] == "reinforce" else td_method)(config)
     return np.asarray(method.estimate(steps, method.weight(steps), value, next_value, squared_score).advantage)
 
 

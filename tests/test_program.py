@@ -9,8 +9,8 @@ import pytest
 import envs
 from jaxpg.config.configuration import flatten
 from jaxpg.config.parsing import compose
-from jaxpg.learning import Reuse
-from jaxpg.program.algorithms import make_algorithm, make_reuse
+from jaxpg.program import algorithms
+from jaxpg.program.algorithms import make_algorithm
 from jaxpg.program.compile import compile_program
 from jaxpg.program.environment import make_env
 from jaxpg.program.schedule import plan
@@ -88,9 +88,14 @@ def test_other_parameters_learn_as_ever_while_sigma_is_scheduled():
     assert abs(of_schedule - of_gradient).max() > 1e-3
 
 
-def test_reuse_is_what_the_options_say():
+def test_ppo_is_made_of_its_options(monkeypatch):
+    given = []
+    monkeypatch.setattr(algorithms, "ppo", lambda *arguments, **options: given.append(options))
     options = ("algo.epochs=3", "algo.minibatches=2", "algo.clip=null", "algo.max_kl=0.1", "algo.value_clip=0.5")
-    assert make_reuse(compose(["algo=ppo", *options])) == Reuse(3, 2, None, 0.5, 0.1)
+    config = compose(["algo=ppo", "algo.num_shards=1", *options])
+    make_algorithm(config, make_env(config))
+    expected = {"epochs": 3, "minibatches": 2, "clip": None, "max_kl": 0.1, "value_clip": 0.5}
+    assert expected.items() <= given[0].items()
 
 
 def trained(*options, chunks=2):

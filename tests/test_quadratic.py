@@ -7,22 +7,20 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from linear_quadratic import random_policy, random_problem
 
-from envs.quadratic import (
+from envs.linear_quadratic import (
     Policy,
     Problem,
-    QuadraticConfig,
     action_value,
     best_policy,
-    chain,
     gradient,
     lambda_targets,
-    make,
     objective,
     optimum,
     riccati_gains,
     state_moments,
     values,
 )
+from envs.quadratic import QuadraticConfig, chain, make
 from jaxpg.config.parsing import compose
 from jaxpg.networks import linear_mean
 from jaxpg.program.algorithms import make_algorithm

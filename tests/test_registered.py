@@ -6,11 +6,8 @@ import sys
 import threading
 from typing import Literal
 
-import hydra
 import pytest
 from environments import SIZES, Config, register
-from hydra.core.config_store import ConfigStore
-from hydra.core.global_hydra import GlobalHydra
 from processes import outcome, tree
 
 import envs
@@ -236,18 +233,6 @@ def test_trainings_in_threads(monkeypatch, tmp_path):
         thread.join()
     assert ended == {"first": 0, "second": 0}
     assert outcome(tmp_path / "first") == outcome(tmp_path / "second")
-
-
-def test_under_a_program_of_hydras_its_state_stays_its_own():
-    """The options of a training are composed while the program's own composition is in use."""
-    store = ConfigStore.instance()
-    store.store(name="config", node={"mine": 3})
-    with hydra.initialize(version_base=None, config_path=None):
-        state = GlobalHydra.instance().hydra
-        compose(["env=pendulum", "algo=td"])
-        assert GlobalHydra.instance().hydra is state
-        assert hydra.compose("config") == {"mine": 3}
-        assert not {"algo", "env", "network"} & set(store.repo)
 
 
 SCRIPT = """

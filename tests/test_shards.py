@@ -14,30 +14,33 @@ from processes import outcome, training
 from test_learning import NETWORKS, a_batch
 
 from jaxpg import collectives, normalization
-from jaxpg.actor_critic import actor_critic, td
+from jaxpg.actor_critic import actor_critic
 from jaxpg.estimators import gae, normalize_advantages
-from jaxpg.learning import Reuse, actor_critic_loss, one_step, several_steps
+from jaxpg.methods import td
+from jaxpg.nonfinite import stop_at_nonfinite
+from jaxpg.ppo import minibatch_steps, ppo, ppo_loss
 from jaxpg.shards import AXIS, in_parts, sharded
-from jaxpg.soundness import sound
 from jaxpg.training import initial_state, train_scan
+from jaxpg.updates import actor_critic_loss, gradient_step
 from jaxpg.vector_env import episode_metrics, vectorize
 
-REUSES = {
-    "td": None,
-    "ppo": Reuse(epochs=2, minibatches=3),
-    "ppo that ends early": Reuse(epochs=3, minibatches=1, max_kl=1e-4),
+ALGORITHMS = {
+    "td": (actor_critic, {}),
+    "ppo": (ppo, {"epochs": 2, "minibatches": 3}),
+    "ppo that ends early": (ppo, {"epochs": 3, "max_kl": 1e-4}),
 }
 
 
-def algorithm(reuse, num_envs, axis_name, life=4):
-    return actor_critic(
+def algorithm(name, num_envs, axis_name, life=4):
+    make, options = ALGORITHMS[name]
+    return make(
         vectorize(Counter(life), num_envs, 7),
         NETWORKS,
         optax.adam(0.01),
         td(0.9, 5, gae(0.95)),
-        reuse=reuse,
         entropy_coef=0.01,
         axis_name=axis_name,
+        **options,
     )
 
 
@@ -94,19 +97,19 @@ def test_episodes_are_counted_in_all_parts():
     close(parts, whole)
 
 
-@pytest.mark.parametrize("reuse", [None, Reuse(epochs=3, minibatches=1), Reuse(epochs=3, minibatches=1, max_kl=1e-3)])
-def test_gradient_steps_are_those_of_the_whole_batch(reuse):
+@pytest.mark.parametrize("steps", [None, {"epochs": 3}, {"epochs": 3, "max_kl": 1e-3}])
+def test_gradient_steps_are_those_of_the_whole_batch(steps):
     """Parameters, optimizer and metrics; with a single minibatch the order of the environments does not matter."""
     params, optimizer = NETWORKS.init(jax.random.key(2)), optax.adam(0.01)
-    batch, loss = a_batch(params), actor_critic_loss(NETWORKS, 0.01, reuse)
+    batch = a_batch(params)
 
-    def learn(axis_name):
-        if reuse is None:
-            return one_step(loss, optimizer, axis_name)
-        return several_steps(loss, optimizer, reuse, axis_name)
+    def make_update(axis_name):
+        if steps is None:
+            return gradient_step(actor_critic_loss(NETWORKS, 0.01), optimizer, axis_name)
+        return minibatch_steps(ppo_loss(NETWORKS, 0.01), optimizer, minibatches=1, axis_name=axis_name, **steps)
 
     def part(axis_name):
-        return lambda batch: learn(axis_name)(params, optimizer.init(params), batch, jax.random.key(3))
+        return lambda batch: make_update(axis_name)(params, optimizer.init(params), batch, jax.random.key(3))
 
     whole = jax.jit(part(None))(batch)
     parts = jax.jit(jax.vmap(part(AXIS), out_axes=None, axis_name=AXIS))(in_two(batch))
@@ -125,7 +128,7 @@ def test_parts_on_devices_of_their_own_are_parts_on_one(name):
     assert len(jax.devices()) == 2
 
     def run(devices):
-        both = sound(sharded(algorithm(REUSES[name], 6, AXIS), 2, devices))
+        both = stop_at_nonfinite(sharded(algorithm(name, 6, AXIS), 2, devices))
         return jax.jit(lambda key: train_scan(both, key, 20))(jax.random.key(4))
 
     with jax.debug_key_reuse(False):  # see test_vmapped_seeds_are_single_seeds

@@ -5,8 +5,8 @@ import numpy as np
 import pytest
 
 from jaxpg.config.configuration import from_dict
+from jaxpg.config.entries import GROUPS
 from jaxpg.config.parsing import compose
-from jaxpg.config.schema import GROUPS
 from jaxpg.config.sweep import settings, sweepable
 from jaxpg.program.agents import crossed, with_values
 from jaxpg.program.algorithms import make_algorithm

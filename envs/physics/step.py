@@ -33,8 +33,6 @@ logger = logging.getLogger(__name__)
 
 StepFn = Callable[..., tuple[jax.Array, ...]]
 
-PHYSICS = ("scalar", "mjx", "mujoco")
-
 _warned: set[bytes] = set()  # digests of the models that `_warn_once` has spoken of
 
 
@@ -75,22 +73,9 @@ def compile_step(
     if physics not in PHYSICS:
         raise ValueError(f"physics is {physics!r}; it must be one of {', '.join(PHYSICS)}")
     check_names(model, inputs, outputs)
-    carried = tuple(name for name in inputs if name in STATE)
+    carried = _carried(inputs)
     results = carried + tuple(name for name in outputs if name not in carried)
-    if physics == "scalar":
-        try:
-            program = scalar_program(model, inputs, results)
-            repeated = in_tiles(program, functools.partial(_program_step, program, inputs, carried, num_substeps))
-        except UnsupportedPrimitive as error:
-            _warn_once(model, "; ".join(likely_obstacles(model)) or str(error))
-            model, physics = _without_lapack(model), "mjx"
-    if physics == "mujoco":
-        repeated = callback_step(model, num_substeps, inputs, results)
-    if physics == "mjx":
-        once, _ = single_step(model, inputs, results)
-
-        def repeated(*arrays):
-            return _repeat(lambda values: once(*values), inputs, carried, num_substeps, arrays)
+    repeated = PHYSICS[physics](model, num_substeps, inputs, results)
 
     def step(*arrays):
         arguments = as_arguments(inputs, types_of(model, inputs), arrays)
@@ -98,6 +83,39 @@ def compile_step(
         return tuple(values[name] for name in outputs)
 
     return step
+
+
+def scalar_step(model: mujoco.MjModel, num_substeps: int, inputs: tuple[str, ...], outputs: tuple[str, ...]) -> StepFn:
+    """The substeps as scalar equations, or as `mjx_step` of a model that has no such form, which is logged.
+
+    Args:
+      model, num_substeps, inputs: as in `compile_step`.
+      outputs: the inputs that a step changes, in their order, and others after them.
+    """
+    try:
+        program = scalar_program(model, inputs, outputs)
+        return in_tiles(program, functools.partial(_program_step, program, inputs, _carried(inputs), num_substeps))
+    except UnsupportedPrimitive as error:
+        _warn_once(model, "; ".join(likely_obstacles(model)) or str(error))
+    return mjx_step(_without_lapack(model), num_substeps, inputs, outputs)
+
+
+def mjx_step(model: mujoco.MjModel, num_substeps: int, inputs: tuple[str, ...], outputs: tuple[str, ...]) -> StepFn:
+    """The substeps as `mjx.step`; arguments as in `scalar_step`."""
+    once, _ = single_step(model, inputs, outputs)
+
+    def repeated(*arrays):
+        return _repeat(lambda values: once(*values), inputs, _carried(inputs), num_substeps, arrays)
+
+    return repeated
+
+
+PHYSICS = {"scalar": scalar_step, "mjx": mjx_step, "mujoco": callback_step}
+
+
+def _carried(inputs: tuple[str, ...]) -> tuple[str, ...]:
+    """The inputs that a step changes, and the next one begins with."""
+    return tuple(name for name in inputs if name in STATE)
 
 
 def scalar_program(model: mujoco.MjModel, inputs: tuple[str, ...], outputs: tuple[str, ...]) -> Program:

@@ -9,7 +9,7 @@ from envs.hints import python
 from envs.options import build
 from jaxpg.commands.options import asks_for_help
 from jaxpg.config import parsing
-from jaxpg.config.schema import CompareOptions
+from jaxpg.config.command_options import CompareOptions
 from jaxpg.errors import UserError
 
 

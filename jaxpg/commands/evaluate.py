@@ -9,7 +9,7 @@ from contextlib import AbstractContextManager, nullcontext
 from typing import TYPE_CHECKING, Any
 
 from jaxpg.commands.options import about_a_run_in
-from jaxpg.config.schema import EvaluateOptions
+from jaxpg.config.command_options import EvaluateOptions
 from jaxpg.errors import UserError
 from jaxpg.store import config_file
 from jaxpg.store.statistics import finite_mean

@@ -6,7 +6,7 @@ import json
 from collections.abc import Sequence
 
 from jaxpg.commands.options import about_a_run
-from jaxpg.config.schema import InspectOptions
+from jaxpg.config.command_options import InspectOptions
 
 
 def main(arguments: Sequence[str]) -> int:

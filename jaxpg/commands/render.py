@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from jaxpg.commands.options import about_a_run_in
-from jaxpg.config.schema import RenderOptions
+from jaxpg.config.command_options import RenderOptions
 
 
 def main(arguments: Sequence[str]) -> int:

@@ -15,7 +15,8 @@ import envs
 from envs.options import OptionError, build, unknown
 from jaxpg.config import conflicts, plain_yaml, registered
 from jaxpg.config import sweep as sweeping
-from jaxpg.config.schema import GROUPS, Run, option_fields
+from jaxpg.config.entries import GROUPS, option_fields
+from jaxpg.config.schema import Run
 from jaxpg.errors import UserError
 
 DEFAULT_ROLLOUT = 16  # steps of a TD rollout where neither the user nor the environment says

@@ -9,8 +9,9 @@ from typing import Any
 
 from envs.options import describe
 from jaxpg.config.configuration import flatten
+from jaxpg.config.entries import GROUPS, option_fields
 from jaxpg.config.parsing import compose
-from jaxpg.config.schema import GROUPS, Run, option_fields
+from jaxpg.config.schema import Run
 from jaxpg.config.sweep import sweepable
 
 SWEEP = (

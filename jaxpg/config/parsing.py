@@ -1,23 +1,27 @@
-"""The command line: `env=arm algo=td algo.lambda_=0.9 seed=3`, in Hydra's grammar.
+"""The command line: `env=arm algo=td algo.lambda_=0.9 seed=3`.
 
 Values that nobody gave come from the environment's registry entry, which keeps what was tuned on it, and else from the
-dataclasses. Hydra reads values and nothing more: a program that runs under Hydra itself has its state to itself, and
-what a user writes stands as it is written, `${...}` too.
+dataclasses.
 """
 
 from __future__ import annotations
 
 import dataclasses
+import re
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from jaxpg.config import registered
+import yaml
+
+from jaxpg.config import plain_yaml, registered
 from jaxpg.config.configuration import Config, check_choices, divide, from_dict, members, unknown_names
 from jaxpg.config.conflicts import nearest_divisor
-from jaxpg.config.schema import GROUPS, LARGEST, Gaussian, Run, option_fields
+from jaxpg.config.entries import GROUPS, option_fields
+from jaxpg.config.schema import LARGEST, Gaussian, Run
 from jaxpg.errors import UserError
 
 DEFAULT_CHOICES = {"env": "pendulum", "algo": "td", "network": "mlp"}  # algo: the first that the environment has tuned
+NAME = re.compile(r"[A-Za-z_][A-Za-z0-9_]*(\.[A-Za-z_][A-Za-z0-9_]*)*")
 FOLDERS = ("run_dir", "resume", "run", "out")  # options whose value is a path
 
 
@@ -25,11 +29,11 @@ def compose(arguments: Sequence[str]) -> Config:
     """The configuration that a command line asks for.
 
     Args:
-      arguments: overrides in Hydra's grammar, `name=value`.
+      arguments: `name=value`.
 
     Raises:
       OptionError, UserError: every unknown name, wrong type and value out of range, of the command line or of the
-        environment's training values; or text that is no override.
+        environment's training values; or text that is no `name=value`.
     """
     given = parse(arguments)
     check_choices(members(given))
@@ -77,43 +81,33 @@ def _fitting(tuned: Mapping[str, Any], given: Mapping[str, Any]) -> Mapping[str,
 
 
 def parse(arguments: Sequence[str]) -> dict[str, Any]:
-    """`name=value` arguments read by Hydra's grammar into plain values.
+    """`name=value` arguments as plain values: numbers, true, false, null, text, and lists of these.
+
+    A value is read as `config.yaml` would read it; a path stands as it is.
 
     Raises:
       UserError: an argument is not of that form, or a name is given twice.
     """
-    from hydra.core.override_parser.overrides_parser import OverridesParser
-    from hydra.errors import HydraException
-
-    parser, given = OverridesParser.create(), {}
+    given = {}
     for argument in arguments:
-        name, _, text = argument.partition("=")
-        if name in FOLDERS and text:
-            value = text  # as it stands: Hydra's grammar has no brackets, commas or spaces in plain words
-        else:
-            try:
-                override = parser.parse_override(argument)
-            except HydraException:
-                raise _not_an_override(argument) from None
-            if override.type.name != "CHANGE" or override.package or override.is_sweep_override():
-                raise _not_an_override(argument)
-            name, value = override.key_or_group, _plain(override.value())
+        name, equals, text = argument.partition("=")
+        if not (equals and NAME.fullmatch(name)):
+            raise _not_an_assignment(argument)
         if name in given:
             raise UserError(f"{name} is given twice")
-        given[name] = value
+        given[name] = text if name in FOLDERS and text else _value(text, argument)
     return given
 
 
-def _not_an_override(argument: str) -> UserError:
+def _value(text: str, argument: str) -> Any:
+    try:
+        return plain_yaml.load_value(text) if text else text
+    except yaml.YAMLError:
+        raise _not_an_assignment(argument) from None
+
+
+def _not_an_assignment(argument: str) -> UserError:
     return UserError(f"'{argument}': expected name=value, such as seed=3; see --help")
-
-
-def _plain(value: Any) -> Any:
-    """Hydra's quoted strings as str, also inside lists."""
-    if isinstance(value, list):
-        return [_plain(element) for element in value]
-    is_plain = isinstance(value, (bool, int, float, dict)) or value is None
-    return value if is_plain else str(getattr(value, "text", value))
 
 
 def _with_defaults(choices: Mapping[str, str], values: Mapping[str, Any]) -> dict[str, Any]:

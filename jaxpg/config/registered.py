@@ -12,7 +12,8 @@ from typing import Any
 import envs
 from envs.hints import python
 from envs.options import OptionError, build, unknown
-from jaxpg.config.schema import GROUPS, Run
+from jaxpg.config.entries import GROUPS
+from jaxpg.config.schema import Run
 
 PROGRAM = "program"  # in config.yaml: what registered the environment
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import re
 import shlex
 from collections.abc import Mapping
@@ -76,6 +77,6 @@ def _text(value: Any) -> str:
 
 
 def _quoted(word: str) -> str:
-    """A word that Hydra's grammar reads as itself, in quotes where it has to be."""
+    """A word that the command line reads as itself, in quotes if it has to be."""
     plain = re.fullmatch(r"[A-Za-z][A-Za-z0-9_]*", word) and word.lower() not in NO_WORDS
-    return word if plain else "'" + word.replace("'", "\\'") + "'"
+    return word if plain else json.dumps(word, ensure_ascii=False)

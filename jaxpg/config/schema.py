@@ -1,4 +1,4 @@
-"""The options of a training run: groups with their members, and the run's own.
+"""The options of a training run: those of each algorithm and network, and the run's own.
 
 Each field has its default, its help and its range. What an environment has its own tuned value for, it says in its
 registry entry. Those made with `number` can be swept; all others are part of the program.
@@ -7,20 +7,18 @@ registry entry. Those made with `number` can be swept; all others are part of th
 from __future__ import annotations
 
 import dataclasses
-import importlib
-from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
-from typing import Any, ClassVar, NamedTuple
+from typing import Any, ClassVar
 
-import envs
 from envs.options import option
-from jaxpg.features import FEATURES
-from jaxpg.networks import ACTIVATIONS, SIGMAS
 
 # The names of functions that are imported later; a test compares them.
 ESTIMATORS = ("td_lambda", "td_zero", "n_step", "monte_carlo")
 BASELINES = ("none", "mean", "time_mean", "leave_one_out", "optimal", "value")
 RETURNS = ("to_go", "whole")
+ACTIVATIONS = ("tanh", "relu", "elu", "swish")
+FEATURES = ("identity", "polynomial", "fourier", "radial")
+SIGMAS = ("fixed", "learned", "scheduled", "state")
 NAN_POLICIES = ("stop", "skip")
 LOGGERS = ("wandb", "mlflow")  # besides TensorBoard
 LARGEST = 2**31 - 1  # size of an array's axis: XLA's indices are 32-bit numbers
@@ -35,27 +33,6 @@ def number(default: float | None, help: str, **bounds: float) -> Any:
     """
     metadata = option(default, help, **bounds).metadata
     return dataclasses.field(default=default, metadata={**metadata, "sweepable": True})
-
-
-class Entry(NamedTuple):
-    """What can be chosen by name: its options, and the function that makes it of them.
-
-    Attributes:
-      options: dataclass of its options.
-      build: the function, or where it is, "module:name": it is imported at its first use, so that options are read
-        without the programs. Of an algorithm `build(config, env) -> Algorithm`, of networks
-        `build(options, observation_size, action_size) -> Networks`.
-    """
-
-    options: type
-    build: Callable[..., Any] | str
-
-    def built(self, *arguments: Any) -> Any:
-        """What `build` makes of the arguments."""
-        if callable(self.build):
-            return self.build(*arguments)
-        module, _, name = self.build.partition(":")
-        return getattr(importlib.import_module(module), name)(*arguments)
 
 
 @dataclass(frozen=True)
@@ -167,8 +144,8 @@ class MLP(Gaussian):
     """Separate multilayer perceptrons for actor and critic, of fixed features of the observation."""
 
     widths: list[int] = option([64, 64], "hidden units by layer", at_least=1)
-    activation: str = option("tanh", "activation of the hidden layers", choices=tuple(ACTIVATIONS))
-    features: str = option("identity", "what the first layer sees", choices=tuple(FEATURES))
+    activation: str = option("tanh", "activation of the hidden layers", choices=ACTIVATIONS)
+    features: str = option("identity", "what the first layer sees", choices=FEATURES)
     order: int = option(2, "degree, highest frequency, or grid points of an axis", at_least=1)
 
 
@@ -176,7 +153,7 @@ class MLP(Gaussian):
 class Linear(Gaussian):
     """Mean and value linear in fixed features of the observation."""
 
-    features: str = option("identity", "what they are linear in", choices=tuple(FEATURES))
+    features: str = option("identity", "what they are linear in", choices=FEATURES)
     order: int = option(2, "degree, highest frequency, or grid points of an axis", at_least=1)
 
 
@@ -210,130 +187,3 @@ class Run:
     loggers: list[str] = option([], "where metrics go besides TensorBoard", choices=LOGGERS)
     cache: bool = option(True, "keep compiled programs in the user's cache folder, for the next run")
     report: bool = option(True, "end with report.html: curves, and episodes to watch")
-
-
-class Options(Mapping[str, type]):
-    """The options of every entry by its name, of those too that are added later.
-
-    Args:
-      entries: gives them by name.
-      attribute: of an entry, which holds its options.
-    """
-
-    def __init__(self, entries: Callable[[], Mapping[str, Any]], attribute: str):
-        self._entries, self._attribute = entries, attribute
-
-    def __getitem__(self, name: str) -> type:
-        return getattr(self._entries()[name], self._attribute)
-
-    def __iter__(self) -> Iterator[str]:
-        return iter(self._entries())
-
-    def __len__(self) -> int:
-        return len(self._entries())
-
-
-ALGORITHMS: dict[str, Entry] = {
-    "td": Entry(TD, "jaxpg.program.algorithms:td"),
-    "ppo": Entry(PPO, "jaxpg.program.algorithms:ppo"),
-    "reinforce": Entry(Reinforce, "jaxpg.program.algorithms:reinforce"),
-    "online": Entry(Online, "jaxpg.program.algorithms:online"),
-}
-NETWORKS: dict[str, Entry] = {
-    "mlp": Entry(MLP, "jaxpg.program.networks:mlp"),
-    "linear": Entry(Linear, "jaxpg.program.networks:linear"),
-}
-GROUPS: dict[str, Mapping[str, type]] = {
-    "env": Options(lambda: envs.REGISTRY, "config"),
-    "algo": Options(lambda: ALGORITHMS, "options"),
-    "network": Options(lambda: NETWORKS, "options"),
-}
-
-
-def option_fields(choices: Mapping[str, str]) -> dict[str, dataclasses.Field]:
-    """Every option under these choices, by its name on the command line."""
-    fields = {field.name: field for field in dataclasses.fields(Run)}
-    for group, choice in choices.items():
-        fields |= {f"{group}.{field.name}": field for field in dataclasses.fields(GROUPS[group][choice])}
-    return fields
-
-
-@dataclass(frozen=True)
-class EvaluateOptions:
-    """Options of the evaluation; options of the environment may be given too, as env.NAME=VALUE."""
-
-    run: str | None = option(None, "run folder; required")
-    episodes: int = option(200, "episodes to play", at_least=2)
-    seed: int = option(0, "fixes the starts", at_least=0, at_most=2**32 - 1)
-    backend: str = option(
-        "mjx", "the run's own environment, the same in C MuJoCo, or Gymnasium's", choices=("mjx", "mujoco", "gymnasium")
-    )
-    policy: str = option("jax", "as trained, or as exported", choices=("jax", "c", "onnx", "stablehlo"))
-    checkpoint: str = option(
-        "best", "the best policy by the evaluations while training, or the last", choices=("best", "last")
-    )
-    agent: int | None = option(None, "which of several agents, from 0 [default: the best]", at_least=0)
-    cache: bool = option(True, "keep the compiled program in the user's cache folder, for the next evaluation")
-    json: bool = option(False, "end with one line of JSON: mean, stderr, success, episodes, diverged")
-
-
-@dataclass(frozen=True)
-class ExportOptions:
-    """Options of the export."""
-
-    run: str | None = option(None, "run folder; required")
-    format: str = option(
-        "c", "a C99 header, an ONNX model, a StableHLO program", choices=("c", "onnx", "stablehlo", "all")
-    )
-    out: str | None = option(None, "folder to write into [default: export in the run folder]")
-    name: str | None = option(None, "what files and C identifiers begin with [default: the environment's name]")
-    overwrite: bool = option(False, "replace files there that no export has written, or that were changed since")
-    checkpoint: str = option(
-        "best", "the best policy by the evaluations while training, or the last", choices=("best", "last")
-    )
-    agent: int | None = option(None, "which of several agents, from 0 [default: the best]", at_least=0)
-
-
-@dataclass(frozen=True)
-class ReportOptions:
-    """Options of the report."""
-
-    run: str | None = option(None, "run folder; required")
-    agent: int | None = option(None, "whose episodes, of several agents, from 0 [default: the best's]", at_least=0)
-    cache: bool = option(True, "keep compiled programs in the user's cache folder, for the next report")
-
-
-@dataclass(frozen=True)
-class CompareOptions:
-    """Options of the comparison."""
-
-    out: str = option("comparison.html", "the page, figure or table to write: .html, .pdf, .svg or .csv")
-
-
-@dataclass(frozen=True)
-class RenderOptions:
-    """Options of the video; options of the environment may be given too, as env.NAME=VALUE."""
-
-    run: str | None = option(None, "run folder; required")
-    out: str | None = option(None, "file to write, .mp4 or .gif [default: video.mp4 in the run folder]")
-    episodes: int = option(4, "episodes side by side", at_least=1, at_most=64)
-    seed: int = option(0, "fixes the starts", at_least=0, at_most=2**32 - 1)
-    checkpoint: str = option(
-        "best",
-        "the best policy by the evaluations while training, the last, or the one before",
-        choices=("best", "last", "untrained"),
-    )
-    agent: int | None = option(None, "which of several agents, from 0 [default: the best]", at_least=0)
-    width: int = option(360, "of one episode's picture, an even number [pixels]", at_least=16)
-    height: int = option(360, "of one episode's picture, an even number [pixels]", at_least=16)
-    speed: float = option(1.0, "of the video; 1 is real time", at_least=0.01, at_most=100)
-    fps: int = option(60, "pictures a second at most; a GIF has 50", at_least=1, at_most=240)
-    cache: bool = option(True, "keep the compiled program in the user's cache folder, for the next video")
-
-
-@dataclass(frozen=True)
-class InspectOptions:
-    """Options of the inspection."""
-
-    run: str | None = option(None, "run folder; required")
-    json: bool = option(False, "print one line of JSON: step, steps, finished, owner, digest, checkpoints")

@@ -12,7 +12,7 @@ from collections.abc import Iterator, Mapping
 from typing import Any
 
 from envs.options import OptionError, build, unknown
-from jaxpg.config.schema import GROUPS, option_fields
+from jaxpg.config.entries import GROUPS, option_fields
 
 PREFIX = "sweep."  # of the option's name, on the command line
 Setting = dict[str, float]  # option -> value

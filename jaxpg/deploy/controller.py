@@ -64,9 +64,9 @@ class Controller(NamedTuple):
       name: what files and identifiers begin with, such as "pendulum".
       interface: names, units and limits of observations and commands.
       mean, scale: observations enter as (s - mean) * scale, `[n]`.
-      features, order: phi, a name in `jaxpg.features.FEATURES` and its order.
+      features, order: phi, a name in `jaxpg.program.networks.FEATURES` and its order.
       layers: of f, with the activation between them.
-      activation: a name in `jaxpg.networks.ACTIVATIONS`.
+      activation: a name in `jaxpg.program.networks.ACTIVATIONS`.
       squash: whether the tanh of the last layer is taken.
       origin: where it comes from, in words by name.
       learner: for going on with learning, if it has been trained step by step; else None.

@@ -14,7 +14,7 @@ import jax
 import numpy as np
 
 from envs.hints import pip_install
-from jaxpg.config.schema import ExportOptions
+from jaxpg.config.command_options import ExportOptions
 from jaxpg.deploy import c, learning, onnx, reference, sealing, stablehlo
 from jaxpg.deploy.controller import Controller, commanding, controller, drawn, played
 from jaxpg.errors import UserError

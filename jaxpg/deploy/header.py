@@ -14,7 +14,8 @@ from jaxpg.deploy import online
 from jaxpg.deploy.controller import FARTHEST, Controller
 from jaxpg.deploy.names import in_comment
 from jaxpg.deploy.sealing import NO_SEAL
-from jaxpg.features import BOUND, monomials, num_features
+from jaxpg.features import BOUND, monomials
+from jaxpg.program.networks import NUM_FEATURES
 
 # Included twice it is there once; another controller of the same name is an error, not left out in silence.
 GUARDED = """\
@@ -240,7 +241,7 @@ def _features(controller: Controller) -> str:
 
 
 def _num_features(controller: Controller) -> int:
-    return num_features(controller.features, controller.observation_size, controller.order)
+    return NUM_FEATURES[controller.features](controller.observation_size, controller.order)
 
 
 def _layers(controller: Controller) -> str:

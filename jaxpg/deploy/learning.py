@@ -9,10 +9,10 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxpg import divergence
-from jaxpg.actor_critic import sampling_policy
 from jaxpg.config.schema import Online
 from jaxpg.networks import Networks, linear_mean
 from jaxpg.online import Traces, learnable, trace_update
+from jaxpg.policy import sampling_policy
 from jaxpg.program.networks import make_networks
 from jaxpg.program.state import Policy
 from jaxpg.rollout import rollout

@@ -1,7 +1,7 @@
 """The algorithms of a run, by the name that the configuration gives them.
 
 An algorithm is a function here, `build(config, env) -> Algorithm` of one agent, and an entry with its options in
-`jaxpg.config.schema.ALGORITHMS`.
+`jaxpg.config.entries.ALGORITHMS`.
 """
 
 from __future__ import annotations
@@ -13,18 +13,21 @@ from typing import Any
 import jax
 import optax
 
-from jaxpg import actor_critic, baselines, estimators, shards
-from jaxpg.actor_critic import Baseline, Method, critic, no_baseline, of_returns, of_scores
+from jaxpg import baselines, estimators, methods, shards
+from jaxpg.actor_critic import actor_critic
+from jaxpg.baselines import Baseline, of_returns, of_scores
 from jaxpg.config.configuration import Config
-from jaxpg.config.schema import ALGORITHMS
+from jaxpg.config.entries import ALGORITHMS
 from jaxpg.estimators import Estimator
-from jaxpg.learning import Reuse, scale_by_progress
+from jaxpg.methods import Method
 from jaxpg.online import online_actor_critic
+from jaxpg.ppo import ppo
 from jaxpg.program.environment import training_length
 from jaxpg.program.networks import make_networks
 from jaxpg.program.schedule import plan
 from jaxpg.program.sigma import labels, left_alone, log_sigma, with_sigma
 from jaxpg.types import Algorithm
+from jaxpg.updates import scale_by_progress
 from jaxpg.vector_env import vectorize
 
 ESTIMATORS: dict[str, Callable[[Any], Estimator]] = {
@@ -34,12 +37,12 @@ ESTIMATORS: dict[str, Callable[[Any], Estimator]] = {
     "monte_carlo": lambda algo: estimators.gae(1.0),
 }
 BASELINES: dict[str, Baseline] = {
-    "none": no_baseline,
+    "none": baselines.zero,
     "mean": of_returns(baselines.batch_mean),
     "time_mean": of_returns(baselines.time_mean),
     "leave_one_out": of_returns(baselines.leave_one_out),
     "optimal": of_scores(baselines.optimal),
-    "value": critic,
+    "value": baselines.critic,
 }
 RETURNS = {"to_go": estimators.reinforce, "whole": estimators.reinforce_whole}
 
@@ -50,22 +53,23 @@ def make_algorithm(config: Config, env: Any) -> Algorithm:
     return with_sigma(algorithm, log_sigma(config)) if config.network.sigma_is == "scheduled" else algorithm
 
 
-def td(config: Config, env: Any) -> Algorithm:
+def make_td(config: Config, env: Any) -> Algorithm:
     """The entry `td`."""
-    return _actor_critic(config, env, td_method(config))
+    return _make(actor_critic, config, env, td_method(config))
 
 
-def ppo(config: Config, env: Any) -> Algorithm:
+def make_ppo(config: Config, env: Any) -> Algorithm:
     """The entry `ppo`."""
-    return _actor_critic(config, env, td_method(config), make_reuse(config))
+    names = ("epochs", "minibatches", "clip", "value_clip", "max_kl")
+    return _make(ppo, config, env, td_method(config), **{name: getattr(config.algo, name) for name in names})
 
 
-def reinforce(config: Config, env: Any) -> Algorithm:
+def make_reinforce(config: Config, env: Any) -> Algorithm:
     """The entry `reinforce`."""
-    return _actor_critic(config, env, reinforce_method(config))
+    return _make(actor_critic, config, env, reinforce_method(config))
 
 
-def online(config: Config, env: Any) -> Algorithm:
+def make_online(config: Config, env: Any) -> Algorithm:
     """The entry `online`."""
     batch = vectorize(env, config.run.num_envs, training_length(config))
     return online_actor_critic(
@@ -76,34 +80,36 @@ def online(config: Config, env: Any) -> Algorithm:
 def td_method(config: Config) -> Method:
     """The estimator of the options of TD and PPO."""
     algo = config.algo
-    return actor_critic.td(algo.gamma, config.run.num_steps, ESTIMATORS[algo.estimator](algo))
+    return methods.td(algo.gamma, config.run.num_steps, ESTIMATORS[algo.estimator](algo))
 
 
 def reinforce_method(config: Config) -> Method:
     """The estimator of the options of REINFORCE."""
     algo = config.algo
-    return actor_critic.reinforce(algo.gamma, BASELINES[algo.baseline], RETURNS[algo.returns], algo.discounted)
+    return methods.reinforce(algo.gamma, BASELINES[algo.baseline], RETURNS[algo.returns], algo.discounted)
 
 
-def make_reuse(config: Config) -> Reuse:
-    """How often PPO learns from a rollout, and within which bounds."""
-    return Reuse(**{name: getattr(config.algo, name) for name in Reuse._fields})
+def _make(make: Callable[..., Algorithm], config: Config, env: Any, method: Method, **options: Any) -> Algorithm:
+    """`actor_critic` or `ppo` with Adam, the environments in shards if the configuration asks for them.
 
-
-def _actor_critic(config: Config, env: Any, method: Method, reuse: Reuse | None = None) -> Algorithm:
-    """Whole rollouts, learned from with Adam; its environments in shards where that is asked for."""
+    Args:
+      make: `actor_critic` or `ppo`.
+      config, env: of the run.
+      method: how it collects steps and estimates advantages.
+      options: those that only `make` has.
+    """
     algo, number = config.algo, config.algo.num_shards
-    algorithm = actor_critic.actor_critic(
+    algorithm = make(
         vectorize(env, config.run.num_envs // number, training_length(config)),
         make_networks(config, env),
         make_optimizer(config),
         method,
-        reuse=reuse,
         reward_scale=algo.reward_scale,
         entropy_coef=algo.entropy_coef,
         normalize_observations=algo.normalize_observations,
         normalize_advantages=algo.normalize_advantages,
         axis_name=shards.AXIS if number > 1 else None,
+        **options,
     )
     return shards.sharded(algorithm, number, jax.devices()) if number > 1 else algorithm
 

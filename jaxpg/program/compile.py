@@ -15,6 +15,7 @@ import numpy as np
 from jaxpg import shards
 from jaxpg.config.configuration import Config
 from jaxpg.evaluation import Episodes, evaluate
+from jaxpg.nonfinite import skip_nonfinite, stop_at_nonfinite
 from jaxpg.policy import deterministic_policy
 from jaxpg.program.agents import Agents, agents_of, with_values
 from jaxpg.program.algorithms import make_algorithm
@@ -22,7 +23,6 @@ from jaxpg.program.backend import OPTIMIZED, RUN_ONCE
 from jaxpg.program.mapping import groups_at_once, in_groups, over_agents
 from jaxpg.program.networks import make_networks
 from jaxpg.program.state import Policy, RunState, current_policy, initial_run
-from jaxpg.soundness import sound
 from jaxpg.training import train_chunk
 from jaxpg.types import Metrics, TrainState
 
@@ -44,6 +44,9 @@ class Program(NamedTuple):
     advance: Callable[..., tuple[TrainState, Metrics]]
     evaluate: Callable[[Policy], Episodes]
     state_shape: RunState
+
+
+NAN_POLICIES = {"stop": stop_at_nonfinite, "skip": skip_nonfinite}
 
 
 def compile_program(
@@ -100,7 +103,7 @@ def _of_one_agent(config: Config, env: Any, chunk: int) -> tuple[Callable, Calla
     run, networks = config.run, make_networks(config, env)
 
     def algorithm(agent):
-        return sound(make_algorithm(with_values(config, agent.values), env), run.nan_policy)
+        return NAN_POLICIES[run.nan_policy](make_algorithm(with_values(config, agent.values), env))
 
     def init(agent):
         return initial_run(algorithm(agent), agent.seed)

@@ -7,7 +7,7 @@ from typing import Any
 import envs
 from envs.options import OptionError
 from jaxpg.config.configuration import Config
-from jaxpg.features import num_features
+from jaxpg.program.networks import NUM_FEATURES
 
 MAX_FEATURES = 10_000  # a grid over many observations is soon beyond any memory
 
@@ -20,7 +20,7 @@ def make_env(config: Config) -> Any:
 
 
 def _check_features(network: Any, observation_size: int) -> None:
-    number = num_features(network.features, observation_size, network.order)
+    number = NUM_FEATURES[network.features](observation_size, network.order)
     if number > MAX_FEATURES:
         name = f"network.features={network.features} network.order={network.order}"
         raise OptionError([f"{name}: {number:,} features of {observation_size} observations; at most {MAX_FEATURES:,}"])

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
-import itertools
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -16,9 +15,10 @@ import jax
 
 from jaxpg.config.configuration import Config, flatten
 from jaxpg.errors import UserError
-from jaxpg.features import num_features
+from jaxpg.networks import Networks
 from jaxpg.posix import resource
 from jaxpg.program.mapping import groups_at_once
+from jaxpg.program.networks import make_networks
 from jaxpg.program.schedule import plan
 from jaxpg.types import PyTree
 
@@ -67,22 +67,43 @@ def needed(config: Config, env: Any) -> int:
 
     It is an estimate from below: XLA may keep more.
     """
-    run, network, algo = config.run, config.network, config.algo
-    state = jax.eval_shape(env.reset, jax.random.key(0))
-    of_env, observation_size = num_bytes(state), state.obs.shape[-1]
-    features = num_features(network.features, observation_size, network.order)
-    widths = [features, *network.widths]
-    params = NUMBER * 2 * (sum(a * b for a, b in itertools.pairwise(widths)) + widths[-1] * env.action_size)
+    run, algo, networks = config.run, config.algo, make_networks(config, env)
+    state, params = (jax.eval_shape(fn, jax.random.key(0)) for fn in (env.reset, networks.init))
+    of_env, of_params, observation_size = num_bytes(state), num_bytes(params), state.obs.shape[-1]
     # Of Adam there are two further numbers for each parameter; of traces one in each environment.
-    agent = params * (3 if algo.keeps_rollouts else run.num_envs) + of_env * run.num_envs
+    agent = of_params * (3 if algo.keeps_rollouts else run.num_envs) + of_env * run.num_envs
     # A rollout as it was played, and the batch that is made of it, with what its gradients pass through.
-    hidden = 2 * sum(widths[1:]) // algo.minibatches
-    step = 2 * observation_size + features + 2 * env.action_size + SCALARS + hidden
+    hidden = num_activations(networks, params, state.obs) // algo.minibatches
+    step = 2 * observation_size + 2 * env.action_size + SCALARS + hidden
     rollout = NUMBER * step * run.num_steps * run.num_envs if algo.keeps_rollouts else 0
     episodes = of_env * run.eval_episodes
     chunk = NUMBER * METRICS * plan(config).chunk
     at_once = min(config.num_agents, run.vmap_seeds * groups_at_once(config))
     return (agent + chunk) * (config.num_agents + at_once) + max(rollout, episodes) * at_once
+
+
+def num_activations(networks: Networks, params: PyTree, obs: PyTree) -> int:
+    """How many numbers the matrix products of actor and critic give for one observation, which backpropagation keeps.
+
+    Args:
+      networks: actor and critic.
+      params, obs: arrays, or their shapes and types.
+    """
+
+    def both(params, obs):
+        return networks.policy(params["actor"], obs), networks.value(params["critic"], obs)
+
+    return sum(_products(jax.make_jaxpr(both)(params, obs).jaxpr))
+
+
+def _products(jaxpr: Any) -> Iterator[int]:
+    """The sizes of the results of all matrix products, also of inner functions."""
+    for equation in jaxpr.eqns:
+        if equation.primitive.name == "dot_general":
+            yield equation.outvars[0].aval.size
+        for inner in jax.tree.leaves(list(equation.params.values()), is_leaf=lambda x: hasattr(x, "eqns")):
+            if hasattr(inner, "eqns"):
+                yield from _products(inner)
 
 
 def num_bytes(tree: PyTree) -> int:

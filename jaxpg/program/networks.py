@@ -1,13 +1,41 @@
-"""The networks of a run, by the name that the configuration gives them."""
+"""The networks of a run, and the functions that its options name."""
 
 from __future__ import annotations
 
+import functools
+import math
+from collections.abc import Callable
 from typing import Any
 
+import jax
+import jax.numpy as jnp
+
+from jaxpg import features, networks
 from jaxpg.config.configuration import Config
-from jaxpg.config.schema import NETWORKS
+from jaxpg.config.entries import NETWORKS
 from jaxpg.distributions import GAUSSIAN, SQUASHED_GAUSSIAN
-from jaxpg.networks import Networks, linear_networks, mlp_networks
+from jaxpg.networks import Networks, Sigma, linear_networks, mlp_networks
+
+ACTIVATIONS = {"tanh": jnp.tanh, "relu": jax.nn.relu, "elu": jax.nn.elu, "swish": jax.nn.swish}
+FEATURES = {
+    "identity": features.identity,
+    "polynomial": features.polynomial,
+    "fourier": features.fourier,
+    "radial": features.radial,
+}
+NUM_FEATURES: dict[str, Callable[[int, int], int]] = {  # of an observation's size and the order
+    "identity": lambda size, order: size,
+    "polynomial": lambda size, order: math.comb(size + order, order) - 1,
+    "fourier": lambda size, order: (order + 1) ** size - 1,
+    "radial": lambda size, order: order**size,
+}
+# A scheduled sigma is a parameter that the optimizer leads (`jaxpg.program.sigma`).
+SIGMAS: dict[str, Callable[[float], Sigma]] = {
+    "fixed": networks.fixed,
+    "learned": networks.learned,
+    "scheduled": networks.learned,
+    "state": networks.state_dependent,
+}
 
 
 def make_networks(config: Config, env: Any) -> Networks:
@@ -15,22 +43,21 @@ def make_networks(config: Config, env: Any) -> Networks:
     return NETWORKS[config.choices["network"]].built(config.network, env.observation_size, env.action_size)
 
 
-def mlp(options: Any, observation_size: int, action_size: int) -> Networks:
+def make_mlp(options: Any, observation_size: int, action_size: int) -> Networks:
     """The entry `mlp`."""
-    return mlp_networks(observation_size, action_size, options.widths, options.activation, **_shared(options))
+    activation = ACTIVATIONS[options.activation]
+    return mlp_networks(observation_size, action_size, options.widths, activation, **_shared(options))
 
 
-def linear(options: Any, observation_size: int, action_size: int) -> Networks:
+def make_linear(options: Any, observation_size: int, action_size: int) -> Networks:
     """The entry `linear`."""
     return linear_networks(observation_size, action_size, **_shared(options))
 
 
 def _shared(options: Any) -> dict[str, Any]:
-    """What every Gaussian policy of features is told."""
+    """What every Gaussian policy of features is made of."""
     return {
-        "features": options.features,
-        "order": options.order,
-        "initial_std": options.sigma,
-        "sigma": options.sigma_is,
+        "features": functools.partial(FEATURES[options.features], order=options.order),
+        "sigma": SIGMAS[options.sigma_is](options.sigma),
         "distribution": SQUASHED_GAUSSIAN if options.squash else GAUSSIAN,
     }

@@ -9,8 +9,8 @@ import numpy as np
 
 from jaxpg.config.configuration import Config
 from jaxpg.divergence import BOUND
+from jaxpg.nonfinite import FLAGS, quantities
 from jaxpg.program.agents import described_agent
-from jaxpg.soundness import FLAGS, quantities
 from jaxpg.store.folder import jsonable
 from jaxpg.types import Metrics, TrainState
 
@@ -29,7 +29,7 @@ def summary(metrics: Metrics) -> dict[str, Any]:
       were not applied, and of environments whose physics diverged.
     """
     values = {name: np.asarray(value, np.float64) for name, value in metrics.items()}
-    unsound = values["unsound"] > 0
+    unsound = values["nonfinite"] > 0
     values = {name: np.where(unsound, np.nan, value) for name, value in values.items() if name not in NO_MEASUREMENTS}
     sums = {name: np.nansum(values.pop(name), axis=-1) for name in ("return_sum", "episodes", "diverged")}
     mean_return = np.where(sums["episodes"] > 0, sums["return_sum"] / np.maximum(sums["episodes"], 1), np.nan)
@@ -88,7 +88,7 @@ class Watch:
 
     def look(self, before: TrainState, metrics: Metrics) -> None:
         """Takes in a chunk: the state that it began with, and its metrics, `[S, chunk]`."""
-        unsound, first_update = np.asarray(metrics["unsound"]), np.asarray(before.update) + 1
+        unsound, first_update = np.asarray(metrics["nonfinite"]), np.asarray(before.update) + 1
         for agent in np.flatnonzero(unsound.any(axis=-1)):
             if agent not in self._noted:
                 self._noted.add(agent)
@@ -107,10 +107,10 @@ class Watch:
             )
 
     def _note(self, agent: int, first_update: int, metrics: Metrics) -> None:
-        codes = np.asarray(metrics["unsound"])[agent]
+        codes = np.asarray(metrics["nonfinite"])[agent]
         at = int(np.argmax(codes > 0))
         what = quantities(metrics)[codes[at] - 1]
-        environment = int(np.asarray(metrics["unsound_env"])[agent, at])
+        environment = int(np.asarray(metrics["nonfinite_env"])[agent, at])
         where = f" of environment {environment}" if environment >= 0 else ""
         problem = f"update {first_update + at:,}: {what}{where} is not finite{self._of(agent)}"
         self.problem = self.problem or problem

@@ -13,7 +13,7 @@ import jax
 import numpy as np
 
 from envs.scenes import Scene
-from jaxpg.config.schema import RenderOptions
+from jaxpg.config.command_options import RenderOptions
 from jaxpg.errors import UserError
 from jaxpg.program.agents import described
 from jaxpg.store import folder, policies

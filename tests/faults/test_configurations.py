@@ -17,7 +17,8 @@ from rounds import examples, rounds
 
 from jaxpg import train
 from jaxpg.commands.ending import run_command
-from jaxpg.config.schema import GROUPS, Run
+from jaxpg.config.entries import GROUPS
+from jaxpg.config.schema import Run
 from jaxpg.program import compile as program
 from jaxpg.store import cache
 

@@ -11,11 +11,12 @@ from processes import LINES, RUN, outcome
 
 from envs.base import State
 from jaxpg.config.parsing import compose
+from jaxpg.nonfinite import quantities, skip_nonfinite, stop_at_nonfinite
 from jaxpg.program.algorithms import make_algorithm
+from jaxpg.program.compile import NAN_POLICIES
 from jaxpg.program.environment import make_env
 from jaxpg.rollout import rollout
 from jaxpg.run.chunks import Watch, summary
-from jaxpg.soundness import quantities, sound
 from jaxpg.training import train_scan
 from jaxpg.types import Algorithm, TrainState
 from jaxpg.vector_env import vectorize
@@ -62,40 +63,35 @@ WHATS = ("observation", "value_loss", "gradient_norm", "parameter")
 def test_stop_stands_still_before_the_update(what, value):
     """However many updates follow: the state, its number included, is that of two updates, to the bit."""
     algorithm = exploding(what, value)
-    state, metrics = train_scan(sound(algorithm, "stop"), KEY, 7)
+    state, metrics = train_scan(stop_at_nonfinite(algorithm), KEY, 7)
     before, _ = train_scan(algorithm, KEY, BAD - 1)
     jax.tree.map(np.testing.assert_array_equal, state, before)
     assert state.update == BAD - 1
     place = 1 + quantities(metrics).index(what)
-    assert metrics["unsound"].tolist() == [0] * (BAD - 1) + [place] * (8 - BAD)
-    assert metrics["unsound_env"].tolist() == [-1] * (BAD - 1) + [1 if what == "observation" else -1] * (8 - BAD)
+    assert metrics["nonfinite"].tolist() == [0] * (BAD - 1) + [place] * (8 - BAD)
+    assert metrics["nonfinite_env"].tolist() == [-1] * (BAD - 1) + [1 if what == "observation" else -1] * (8 - BAD)
 
 
 @pytest.mark.parametrize("what", WHATS)
 def test_skip_learns_nothing_from_the_update_and_goes_on(what):
-    state, metrics = train_scan(sound(exploding(what, jnp.nan), "skip"), KEY, 7)
+    state, metrics = train_scan(skip_nonfinite(exploding(what, jnp.nan)), KEY, 7)
     learned = 7 - 1
     for counted in (state.params, state.opt_state, state.normalizer):
         np.testing.assert_array_equal(counted, learned)
     np.testing.assert_array_equal(state.env_state.obs, learned if what == "observation" else 7)
     assert state.update == 7
-    assert (metrics["unsound"] > 0).tolist() == [update == BAD for update in range(1, 8)]
+    assert (metrics["nonfinite"] > 0).tolist() == [update == BAD for update in range(1, 8)]
 
 
 @pytest.mark.parametrize("what", WHATS)
 def test_what_exploded_is_named_as_it_is(what):
     """The place that the program counts is found again among the metrics' names."""
-    state, metrics = train_scan(sound(exploding(what, jnp.nan)), KEY, 5)
+    state, metrics = train_scan(stop_at_nonfinite(exploding(what, jnp.nan)), KEY, 5)
     watch = Watch(compose([]), print)
     watch.look(state._replace(update=np.zeros(1, int)), {name: np.asarray(x)[None] for name, x in metrics.items()})
     where = " of environment 1" if what == "observation" else ""
     assert watch.problem == f"update {BAD}: {what}{where} is not finite"
     assert watch.nobody_goes_on, "it would make the same update again"
-
-
-def test_other_policies_are_refused():
-    with pytest.raises(ValueError, match="stop, skip"):
-        sound(exploding("parameter", 0.0), "ignore")
 
 
 @pytest.mark.parametrize(
@@ -112,10 +108,10 @@ def test_what_is_sound_is_left_alone(policy, algo):
     algorithm = make_algorithm(config, make_env(config))
     (plain, _), (watched, metrics) = (
         jax.jit(lambda algorithm=algorithm: train_scan(algorithm, KEY, 5))()
-        for algorithm in (algorithm, sound(algorithm, policy))
+        for algorithm in (algorithm, NAN_POLICIES[policy](algorithm))
     )
     jax.tree.map(lambda x, y: np.testing.assert_allclose(y, x, **TOLERANCE), _numbers(plain), _numbers(watched))
-    assert not metrics["unsound"].any()
+    assert not metrics["nonfinite"].any()
 
 
 def _numbers(tree):
@@ -185,9 +181,9 @@ def test_a_reset_that_is_not_finite_is_an_observation():
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(algorithms, "vectorize", lambda env, *sizes: vectorize(Born("obs", 0.0), *sizes))
         algorithm = make_algorithm(config, Born("obs", 0.0))
-        _, metrics = train_scan(sound(algorithm), KEY, 1)
-    assert quantities(metrics)[metrics["unsound"][0] - 1] == "observation"
-    assert metrics["unsound_env"][0] == 0
+        _, metrics = train_scan(stop_at_nonfinite(algorithm), KEY, 1)
+    assert quantities(metrics)[metrics["nonfinite"][0] - 1] == "observation"
+    assert metrics["nonfinite_env"][0] == 0
 
 
 # --- lines and notes --------------------------------------------------------------------------------------------------
@@ -198,8 +194,8 @@ METRICS = {
     "episodes": [[1.0, 1.0, 1.0], [0.0] * 3],
     "diverged": [[0.0, 0.0, 2.0], [0.0] * 3],
     "diverged_env": [[-1, -1, 5], [-1] * 3],
-    "unsound": [[0, 3, 0], [2, 2, 2]],
-    "unsound_env": [[-1, -1, -1], [-1] * 3],
+    "nonfinite": [[0, 3, 0], [2, 2, 2]],
+    "nonfinite_env": [[-1, -1, -1], [-1] * 3],
 }
 
 

@@ -1,0 +1,4 @@
+# MuJoCo's classes and functions are in a compiled module without type information.
+from typing import Any
+
+def __getattr__(name: str) -> Any: ...
