@@ -23,7 +23,7 @@ check_jaxlib(jaxlib.__version__)
 __version__ = "0.1.0"
 
 if TYPE_CHECKING:
-    from jaxpg.deploy.policy import Policy
+    from jaxpg.deploy.python_policy import Policy
 
 
 def load(run: str | os.PathLike[str], checkpoint: str = "best", agent: int | None = None) -> Policy:
@@ -42,6 +42,6 @@ def load(run: str | os.PathLike[str], checkpoint: str = "best", agent: int | Non
     Raises:
       jaxpg.errors.UserError: no run folder, no checkpoint in it, no such agent, or an unknown environment.
     """
-    from jaxpg.deploy import policy  # with the environments, slow to import
+    from jaxpg.deploy import python_policy  # with the environments, slow to import
 
-    return policy.load(run, checkpoint, agent)
+    return python_policy.load(run, checkpoint, agent)

@@ -9,7 +9,7 @@ import pytest
 
 from envs import hints, playground_env
 from envs.options import OptionError
-from jaxpg.deploy.export import FORMATS
+from jaxpg.deploy.exporter import FORMATS
 from jaxpg.errors import UserError
 from jaxpg.store.loggers import follower
 from jaxpg.watch import episodes, movie

@@ -126,7 +126,7 @@ def test_help_loads_nothing_heavy():
 
 
 def test_a_stored_policy_is_read_without_what_trained_it():
-    loaded = loaded_by("import jaxpg.deploy.policy, jaxpg.store.policies, jaxpg.store.checkpoint")
+    loaded = loaded_by("import jaxpg.deploy.python_policy, jaxpg.store.policies, jaxpg.store.checkpoint")
     training = {"losses", "estimators", "baselines", "learning", "actor_critic", "online", "shards"}
     assert not loaded & {f"jaxpg.{name}" for name in training}
     assert not loaded & {"jaxpg.program.compile", "jaxpg.program.algorithms", "optax"}

@@ -96,6 +96,6 @@ def _playing(stored: Any, form: str) -> AbstractContextManager[Any]:
     """The stored policy as it is, or as exported."""
     if form == "jax":
         return nullcontext(stored)
-    from jaxpg.deploy.export import as_written
+    from jaxpg.deploy.exporter import replace_by_export
 
-    return as_written(stored, form)
+    return replace_by_export(stored, form)

@@ -12,7 +12,7 @@ def main(arguments: Sequence[str]) -> int:
     """The export command; returns its exit status."""
     options = about_a_run("export", ExportOptions, arguments)
     if options is not None:
-        from jaxpg.deploy import export
+        from jaxpg.deploy import exporter
 
-        export.export(options, print)
+        exporter.export(options, print)
     return 0

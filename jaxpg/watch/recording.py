@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxpg.deploy.controller import physical
+from jaxpg.deploy.controller import to_physical
 from jaxpg.evaluation import play
 from jaxpg.program.backend import RUN_ONCE
 from jaxpg.program.state import Policy
@@ -82,7 +82,7 @@ def _played(stored: StoredPolicy, policy: Policy, starts: jax.Array, look: Calla
 
     def shown(step):
         value = stored.value(policy, step.before.obs)
-        return look(step.after), physical(stored.interface, step.action), step.reward, value, step.metrics
+        return look(step.after), to_physical(stored.interface, step.action), step.reward, value, step.metrics
 
     length = stored.config.env.episode_length
     episodes, (after, command, reward, value, metrics) = play(
