@@ -243,7 +243,7 @@ def test_what_is_no_run_is_left_out_with_a_note(run, tmp_path, capsys, monkeypat
     (tmp_path / "comparison.html").write_text("<!DOCTYPE html>")
     (tmp_path / "notes").mkdir()
     assert compare.main(["a", "b", "comparison.html", "notes", "out=comparison.html"]) == 0
-    assert capsys.readouterr().out.startswith("note: left out, as it is no run folder: comparison.html, notes\n")
+    assert capsys.readouterr().out.startswith("note: skipped, not a run folder: comparison.html, notes\n")
     assert "algo=ppo" in (tmp_path / "comparison.html").read_text()
     with pytest.raises(UserError, match="nowhere is not a run folder"):
         compare.main(["a", "b", "nowhere", "out=comparison.html"])

@@ -14,7 +14,7 @@ from exploding import Blind, ExplodingConfig, Falls, Servo
 from hypothesis import given
 from hypothesis import strategies as st
 
-from jaxpg.commands.evaluate import _rows
+from jaxpg.commands.evaluate import _format_results
 from jaxpg.evaluation import evaluate, play
 from jaxpg.program.state import Best, better
 from jaxpg.store.statistics import counted_returns
@@ -175,7 +175,7 @@ def test_an_observation_out_of_bounds_ends_in_one_line(program, tmp_path):
 def test_what_is_no_number_is_said_in_words():
     nothing, mixed = np.full(2, np.nan), np.array([np.nan, 0.5])
     metrics = {"success": nothing, "distance": nothing, "height": mixed}
-    rows = _rows(Results(np.array([1.0, 2.0]), np.zeros(2, bool), metrics))
+    rows = _format_results(Results(np.array([1.0, 2.0]), np.zeros(2, bool), metrics))
     assert (rows["success"], rows["distance"]) == ("n/a", "n/a")
     assert rows["height"].startswith("0.5 ")
 

@@ -66,7 +66,7 @@ def test_a_disk_that_stays_full_is_status_5(command, command_environment, disk, 
         said = process.stdout.read()
         assert process.wait() == 5, said
     assert said.count(SAVE_FAILED) == said.count(LOST) == 1
-    assert said.endswith(f"error: the last state, at {16 * LINES:,} steps, {LOST}{folder} repeats what is lost\n")
+    assert said.endswith(f"error: the last state, at {16 * LINES:,} steps, {LOST}{folder} repeats the lost updates\n")
     assert "Traceback" not in said
     (disk / "ballast").unlink()
     found = json.loads(command("inspect", f"run={folder}", "json=true").stdout)

@@ -139,4 +139,4 @@ def test_nothing_is_imported_before_it_is_needed():
 
 
 def test_what_is_imported_while_xla_compiles_is_there():
-    assert "matplotlib.figure" in loaded_by("from jaxpg.run import session; session._import_the_rest()")
+    assert "matplotlib.figure" in loaded_by("from jaxpg.run import session; session._import_late_modules()")

@@ -83,7 +83,7 @@ def test_a_damaged_checkpoint_is_named_and_the_one_before_it_used(runs, command,
     result = command("train", f"resume={folder}")
     assert result.returncode == 0, result.stderr
     assert "checkpoints/12: " in result.stdout
-    assert "the one before it is used" in result.stdout
+    assert "using the one before it" in result.stdout
     assert inspected(command, folder) == inspected(command, runs / "run")
 
 

@@ -54,7 +54,7 @@ def test_the_rate_counts_the_steps_of_all_agents(num_agents, monkeypatch, capsys
 
 def test_what_takes_its_time_is_named_with_a_clock_or_in_a_line(display):
     shown, written = display
-    with shown.working("compiling [a b]"):
+    with shown.show_status("compiling [a b]"):
         time.sleep(1.3)
         shown.say("note: said meanwhile")
     text = written.getvalue()

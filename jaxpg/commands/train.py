@@ -1,11 +1,11 @@
-"""`python -m jaxpg.train`: trains an agent and leaves a run folder behind; `--help` lists every option."""
+"""`python -m jaxpg.train`: trains an agent and writes a run folder; `--help` lists every option."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 
 import envs
-from jaxpg.commands.options import check_named
+from jaxpg.commands.options import check_option_named
 from jaxpg.config import help, parsing
 
 
@@ -17,7 +17,7 @@ def main(arguments: Sequence[str]) -> int:
     from jaxpg.run import session
     from jaxpg.watch.closing import show_results
 
-    check_named("resume", arguments)
+    check_option_named("resume", arguments)
     given = parsing.parse(arguments)
     if given.get("resume") == "auto":
         asked = parsing.compose([text for text in arguments if text != "resume=auto"])

@@ -13,7 +13,7 @@ from jaxpg.config import registered
 from jaxpg.program import agents
 from jaxpg.run.loop import Session
 from jaxpg.run.session import Times
-from jaxpg.run.terminal import shown
+from jaxpg.run.terminal import format_metric
 from jaxpg.store import folder, results
 from jaxpg.store.folder import jsonable
 from jaxpg.store.statistics import finite_mean
@@ -45,7 +45,8 @@ def _evaluated(lines: list[dict[str, Any]]) -> dict[str, str]:
     """What the evaluations say, the last of which is of the end of the run."""
     last = [line for line in lines if "eval_return" in line][-1]
     best = results.best_returns(lines)
-    rows = {"deterministic return": f"{shown(last['eval_return'])} at the end, {shown(jsonable(best))} at best"}
+    at_end, at_best = format_metric(last["eval_return"]), format_metric(jsonable(best))
+    rows = {"deterministic return": f"{at_end} at the end, {at_best} at best"}
     untrained = np.count_nonzero(~np.isfinite(best))
     if untrained:
         whose = f" of {untrained} of the {len(best)} agents" if len(best) > 1 else ""

@@ -9,7 +9,7 @@ from jaxpg.program import agents
 from jaxpg.program.backend import prepare
 from jaxpg.program.schedule import Schedule, plan
 from jaxpg.run.loop import is_solved
-from jaxpg.run.terminal import shown
+from jaxpg.run.terminal import format_metric
 from jaxpg.store import config_file, folder, lock, same_run, versions
 from jaxpg.store.checkpoint import CheckpointError, Checkpoints
 from jaxpg.store.folder import RunFolder, jsonable
@@ -123,7 +123,7 @@ def _returns(found: Inspection) -> dict[str, str]:
     if not evaluations:
         return {}
     best = jsonable(best_returns(found.lines))
-    rows = {"return": f"{shown(evaluations[-1])} at the last evaluation, {shown(best)} at best"}
+    rows = {"return": f"{format_metric(evaluations[-1])} at the last evaluation, {format_metric(best)} at best"}
     if found.config.sweep:
         setting, score = next(iter(table(found.config, found.lines).items()))
         rows["best setting"] = f"{setting}: {score}"

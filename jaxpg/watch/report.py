@@ -14,7 +14,7 @@ from jaxpg.config import configuration, repeat
 from jaxpg.config.configuration import Config
 from jaxpg.program import agents
 from jaxpg.program.compile import SELECTION_SEED
-from jaxpg.run.terminal import shown
+from jaxpg.run.terminal import format_metric
 from jaxpg.store import config_file, folder, policies, results
 from jaxpg.store.cache import compilation_cache, physics_cache
 from jaxpg.store.folder import RunFolder
@@ -119,8 +119,8 @@ def _progress(config: Config, lines: Sequence[Json]) -> list[list[str]]:
     rows = [["trained", f"{last['steps']:,} steps in {last['seconds']:.1f} s, {last['update']:,} updates"]]
     evaluated = [line for line in lines if "eval_return" in line]
     if evaluated and config.num_agents > 1:
-        best = shown(folder.jsonable(results.best_returns(lines)))
-        mean = f"{shown(evaluated[-1]['eval_return'])} at the last evaluation, {best} at the best of each"
+        best = format_metric(folder.jsonable(results.best_returns(lines)))
+        mean = f"{format_metric(evaluated[-1]['eval_return'])} at the last evaluation, {best} at the best of each"
         rows.append([f"mean return of {config.num_agents} agents", mean])
     return rows
 
