@@ -17,7 +17,7 @@ from hypothesis import strategies as st
 from jaxpg.commands.evaluate import _format_results
 from jaxpg.evaluation import evaluate, play
 from jaxpg.program.state import Best, better
-from jaxpg.store.statistics import counted_returns
+from jaxpg.store.statistics import penalize_diverged
 from jaxpg.watch import closing
 from jaxpg.watch.episodes import Results
 
@@ -76,18 +76,18 @@ returns = st.lists(st.floats(-1e6, 1e6), min_size=1, max_size=8)
 def test_a_diverged_episode_never_looks_good(values, data):
     """It counts no more than any sound one and no more than 0, whatever it earned; the sound ones stay as they are."""
     mask = np.array(data.draw(st.lists(st.booleans(), min_size=len(values), max_size=len(values))))
-    counted = counted_returns(np.array(values), mask)
+    counted = penalize_diverged(np.array(values), mask)
     np.testing.assert_array_equal(counted[~mask], np.array(values)[~mask])
     if mask.all():
         assert np.isnan(counted).all()
     else:
         assert (counted[mask] <= min(0.0, counted[~mask].min())).all()
-        spoiled = counted_returns(np.where(mask, np.nan, values), mask)
+        spoiled = penalize_diverged(np.where(mask, np.nan, values), mask)
         np.testing.assert_array_equal(spoiled, counted)
 
 
 def test_rows_are_counted_apart():
-    found = counted_returns(np.array([[1.0, 2.0], [-1.0, 5.0]]), np.array([[True, True], [False, True]]))
+    found = penalize_diverged(np.array([[1.0, 2.0], [-1.0, 5.0]]), np.array([[True, True], [False, True]]))
     np.testing.assert_array_equal(found, [[np.nan, np.nan], [-1.0, -1.0]])
 
 

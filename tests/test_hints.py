@@ -74,7 +74,7 @@ def without_flatbuffers(monkeypatch):
 
 def without_a_logger(monkeypatch):
     monkeypatch.setattr(follower, "_is_installed", lambda package: False)
-    follower.check(["wandb"])
+    follower.check_installed(["wandb"])
 
 
 def without_av(monkeypatch):

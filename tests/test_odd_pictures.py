@@ -23,7 +23,7 @@ from jaxpg.normalization import RunningStatistics
 from jaxpg.program.networks import make_networks
 from jaxpg.program.state import Policy
 from jaxpg.store.folder import RunFolder
-from jaxpg.store.policies import stored_policy
+from jaxpg.store.policies import make_stored_policy
 from jaxpg.watch import attempts, player, report
 from jaxpg.watch.attempts import NotDrawn, attempt
 from jaxpg.watch.page import page
@@ -91,7 +91,7 @@ def shown(monkeypatch, tmp_path):
         env = entry.build(config.env)
         params = make_networks(config, env).init(jax.random.key(1))
         statistics = RunningStatistics(jnp.array(1.0), jnp.zeros(2), jnp.ones(2))
-        best = stored_policy(config, env, Policy(params, statistics), 1, "seed 0")
+        best = make_stored_policy(config, env, Policy(params, statistics), 1, "seed 0")
         lines = [{"update": 1, "steps": 10, "seconds": 1.0, "eval_return": -1.0}]
         (tmp_path / "metrics.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines))
         (tmp_path / "versions.json").write_text("{}")

@@ -44,7 +44,7 @@ def main(arguments: Sequence[str]) -> int:
 
 
 def _format_results(results: Results) -> dict[str, str]:
-    """The lines to print, by name; for diverged episodes see `jaxpg.store.statistics.counted_returns`."""
+    """The lines to print, by name; for diverged episodes see `jaxpg.store.statistics.penalize_diverged`."""
     number, num_diverged = len(results.returns), int(results.diverged.sum())
     mean, stderr = _mean(results.returns)
     rows = {"return": f"{mean:.2f} +- {stderr:.2f} (mean and standard error, {number} episodes)"}

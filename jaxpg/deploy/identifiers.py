@@ -20,8 +20,8 @@ def make_identifier(name: str) -> str:
 
     Something always follows it (`NAME_command`, `NAME.h`), so it may be a keyword.
 
-    >>> identifier("humanoid/run-2"), identifier("2link"), identifier("Rücken"), identifier("机"), identifier("math")
-    ('humanoid_run_2', 'policy_2link', 'Rucken', 'policy', 'policy_math')
+    >>> [make_identifier(name) for name in ("humanoid/run-2", "2link", "Rücken", "机", "math")]
+    ['humanoid_run_2', 'policy_2link', 'Rucken', 'policy', 'policy_math']
     """
     ascii_letters = unicodedata.normalize("NFKD", name).encode("ascii", "ignore").decode()
     word = re.sub(r"[^0-9A-Za-z]+", "_", ascii_letters)[:MAX_LENGTH].strip("_")
@@ -32,7 +32,7 @@ def make_identifier(name: str) -> str:
 def escape_text(text: str) -> str:
     """The text on one line and encodable: characters that cannot be printed are escaped.
 
-    >>> print(printable("angle [°]\\nsecond line"))
+    >>> print(escape_text("angle [°]\\nsecond line"))
     angle [°]\\nsecond line
     """
     return "".join(x if x.isprintable() else x.encode("unicode_escape").decode() for x in text)
@@ -41,7 +41,7 @@ def escape_text(text: str) -> str:
 def escape_comment(text: str) -> str:
     """The text for a C comment: it neither ends the comment, begins another, nor joins its line to the next.
 
-    >>> print(in_comment("speed [m/*s] */ ??/"))
+    >>> print(escape_comment("speed [m/*s] */ ??/"))
     speed [m/ *s] * / ? ?/
     """
     separated = re.sub(r"(?<=\*)(?=/)|(?<=/)(?=\*)|(?<=\?)(?=\?)", " ", escape_text(text))

@@ -86,7 +86,7 @@ def learn(
 def compare(found: np.ndarray, expected: np.ndarray) -> np.ndarray:
     """max |a - b| / max(1, |b|) over the parameters after each step, `[T, P]` to `[T]`; NaN if any is.
 
-    >>> differences(np.array([[1.5, 200.0]]), np.array([[1.0, 100.0]])).tolist()
+    >>> compare(np.array([[1.5, 200.0]]), np.array([[1.0, 100.0]])).tolist()
     [1.0]
     """
     with np.errstate(all="ignore"):  # diverged numbers
@@ -96,7 +96,7 @@ def compare(found: np.ndarray, expected: np.ndarray) -> np.ndarray:
 def rounding_effect(
     learn: Callable[[Transition], jax.Array], transition: Transition, expected: np.ndarray
 ) -> np.ndarray:
-    """The effect of float rounding on the parameters after each step, `[T]`, as `compare`.
+    """The effect of float rounding on the parameters after each step, `[T]`, measured as in `compare`.
 
     The largest difference so far when every number of the steps changes by one float32 epsilon; infinite once a number
     is not finite.

@@ -16,7 +16,7 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 from jaxpg.errors import UserError
-from jaxpg.store.files import opened, read, through
+from jaxpg.store.files import descriptor_path, open_folder, read
 
 NO_SEAL = "jaxpg:" + 16 * "0"
 SEAL = re.compile(rb"jaxpg:[0-9a-f]{16}")
@@ -25,7 +25,7 @@ SEAL = re.compile(rb"jaxpg:[0-9a-f]{16}")
 def add_seal(content: bytes) -> bytes:
     """The content of a file with `NO_SEAL` replaced by its seal.
 
-    >>> is_sealed(sealed(f"/* {NO_SEAL} */".encode()))
+    >>> is_sealed(add_seal(f"/* {NO_SEAL} */".encode()))
     True
     """
     return content.replace(NO_SEAL.encode(), _make_seal(content))
@@ -72,7 +72,7 @@ def check_folder(out: Path) -> None:
     """Raises UserError if the folder cannot be used: a file has its name, or it is a link in a run folder."""
     if out.exists() and not out.is_dir():
         raise UserError(f"out={out}: a file has that name")
-    with _report_errors(out), contextlib.suppress(FileNotFoundError), opened(out):
+    with _report_errors(out), contextlib.suppress(FileNotFoundError), open_folder(out):
         pass
 
 
@@ -90,7 +90,7 @@ def move_into(paths: Sequence[Path], out: Path) -> None:
         raise UserError(f"out={out}: {', '.join(folders)} is a folder there")
     with _report_errors(out):
         out.parent.mkdir(parents=True, exist_ok=True)
-        with opened(out, make=True) as folder, _make_folder(folder, out) as place:
+        with open_folder(out, make=True) as folder, _make_folder(folder, out) as place:
             for path in paths:
                 shutil.copyfile(path, place / path.name)
             for path in paths:
@@ -99,7 +99,7 @@ def move_into(paths: Sequence[Path], out: Path) -> None:
 
 @contextlib.contextmanager
 def _make_folder(folder: int, out: Path) -> Iterator[Path]:
-    with tempfile.TemporaryDirectory(dir=through(folder, out), prefix=".export-") as place:
+    with tempfile.TemporaryDirectory(dir=descriptor_path(folder, out), prefix=".export-") as place:
         yield Path(place)
 
 

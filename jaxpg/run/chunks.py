@@ -11,7 +11,7 @@ from jaxpg.config.configuration import Config
 from jaxpg.divergence import BOUND
 from jaxpg.program.agents import described_agent
 from jaxpg.soundness import FLAGS, quantities
-from jaxpg.store.folder import jsonable
+from jaxpg.store.folder import to_json
 from jaxpg.types import Metrics, TrainState
 
 NO_MEASUREMENTS = (*FLAGS, "diverged_env")
@@ -35,7 +35,7 @@ def summarize(metrics: Metrics) -> dict[str, Any]:
     mean_return = np.where(sums["episodes"] > 0, sums["return_sum"] / np.maximum(sums["episodes"], 1), np.nan)
     counts = {"skipped": unsound.sum(axis=-1), "diverged": sums["diverged"]}
     results = {"return": mean_return, "episodes": sums["episodes"]} | {name: _mean(x) for name, x in values.items()}
-    return {name: jsonable(x) for name, x in (results | counts).items()}
+    return {name: to_json(x) for name, x in (results | counts).items()}
 
 
 def _mean(values: np.ndarray) -> np.ndarray:
@@ -47,7 +47,7 @@ def _mean(values: np.ndarray) -> np.ndarray:
 def _count_trailing(flags: np.ndarray) -> np.ndarray:
     """The number of consecutive true entries at the end of each row.
 
-    >>> _at_the_end(np.array([[True, False, True, True], [True, True, False, False]])).tolist()
+    >>> _count_trailing(np.array([[True, False, True, True], [True, True, False, False]])).tolist()
     [2, 0]
     """
     return np.cumprod(flags[:, ::-1], axis=-1).sum(axis=-1)

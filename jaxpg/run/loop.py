@@ -17,11 +17,11 @@ from jaxpg.run.chunks import PATIENCE, NonFiniteMonitor, summarize
 from jaxpg.run.signals import StopRequests
 from jaxpg.run.terminal import Display
 from jaxpg.run.watchdog import Watchdog
-from jaxpg.store.folder import RunFolder, jsonable
+from jaxpg.store.folder import RunFolder, to_json
 from jaxpg.store.keeper import Keeper
 from jaxpg.store.metrics_log import MetricsLog
-from jaxpg.store.names import own_metrics
-from jaxpg.store.statistics import counted_returns, finite_mean
+from jaxpg.store.names import rename_metrics
+from jaxpg.store.statistics import finite_mean, penalize_diverged
 from jaxpg.types import Metrics, TrainState
 
 
@@ -120,11 +120,11 @@ def _evaluate(program: Program, state: RunState) -> tuple[RunState, dict[str, An
     """Evaluates the deterministic policy; returns the state with the best policy so far, and the results."""
     policy = current_policy(state.train)
     episodes = jax.tree.map(np.asarray, program.evaluate(policy))
-    returns = counted_returns(episodes.episode_return, episodes.diverged).mean(axis=-1)
-    results = {name: finite_mean(value) for name, value in own_metrics(episodes.metrics).items()}
+    returns = penalize_diverged(episodes.episode_return, episodes.diverged).mean(axis=-1)
+    results = {name: finite_mean(value) for name, value in rename_metrics(episodes.metrics).items()}
     results |= {"return": returns, "diverged": episodes.diverged.sum(axis=-1)}
     best = better(state.best, Best(policy, returns.astype(np.float32)))
-    return state._replace(best=best), {f"eval_{name}": jsonable(value) for name, value in results.items()}
+    return state._replace(best=best), {f"eval_{name}": to_json(value) for name, value in results.items()}
 
 
 def is_solved(run: Run, best_returns: np.ndarray) -> bool:

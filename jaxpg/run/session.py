@@ -28,7 +28,7 @@ from jaxpg.run.terminal import Display
 from jaxpg.store import config_file, folder, lock, results, same_run, versions
 from jaxpg.store.cache import compilation_cache, physics_cache, timed
 from jaxpg.store.folder import RunFolder
-from jaxpg.store.lines import up_to
+from jaxpg.store.lines import select_until
 from jaxpg.store.loggers import follower
 from jaxpg.types import TrainState
 
@@ -64,12 +64,12 @@ def begin(config: Config, finish: Finish, check: Callable[[RunFolder], None] = f
       check: raises UserError if the folder holds something that must not be overwritten.
     """
     prepare(config)
-    follower.check(config.run.loggers)
+    follower.check_installed(config.run.loggers)
     env = _make_env(config)  # before anything is written, as it may raise an error
-    run_folder = folder.planned(config)
+    run_folder = folder.choose(config)
     lock.check_free(run_folder.path)
     check(run_folder)
-    with folder.owned(run_folder, print):
+    with folder.own(run_folder, print):
         check(run_folder)  # again, now that the folder is locked
         return _begin(config, finish, env, run_folder)
 
@@ -108,7 +108,7 @@ def resume(given: Mapping[str, Any], finish: Finish) -> int:
     """Resumes the run in `given["resume"]` from its newest checkpoint; returns the exit status."""
     changes = {name: value for name, value in given.items() if name != "resume"}
     run_folder = folder.find(str(given["resume"]))
-    with folder.owned(run_folder, print):
+    with folder.own(run_folder, print):
         stored = config_file.load(run_folder.config)
         config = configuration.change(stored, changes)
         same_run.check_options(run_folder, stored, config)
@@ -123,10 +123,10 @@ def begin_or_resume(config: Config, finish: Finish) -> int:
     """
     if config.run.run_dir is None:
         raise UserError("resume=auto needs run_dir=DIR: the folder to begin in, or to resume from")
-    run_folder = folder.planned(config)
+    run_folder = folder.choose(config)
     if not folder.has_checkpoints(run_folder):
         return begin(config, finish, folder.check_nothing_to_lose)
-    with folder.owned(run_folder, print):
+    with folder.own(run_folder, print):
         stored = config_file.load(run_folder.config)
         # The folder may have been moved, or its path may be written differently.
         config = dataclasses.replace(config, run=dataclasses.replace(config.run, run_dir=stored.run.run_dir))
@@ -138,7 +138,7 @@ def _continue(stored: Config, config: Config, finish: Finish, run_folder: RunFol
     from jaxpg.store.checkpoint import Checkpoints
 
     recorded_versions = folder.read_versions(run_folder)
-    follower.check(config.run.loggers)
+    follower.check_installed(config.run.loggers)
     prepare(config, recorded_versions.get("threads"))  # before orbax, which starts the backend too
     checkpoints = Checkpoints(run_folder.checkpoints)
     if checkpoints.latest() is None:
@@ -153,8 +153,8 @@ def _continue(stored: Config, config: Config, finish: Finish, run_folder: RunFol
     if _report_if_finished(session, update):
         finish(session, None)
         return 0
-    now = versions.versions()
-    changed = versions.changes(recorded_versions, now)
+    now = versions.collect_versions()
+    changed = versions.find_changes(recorded_versions, now)
     _announce_resume(session, update, described_jump(stored, config, update), changed)
     program, seconds = _compile(session, _make_env(config), resumed=True)
     state = checkpoints.restore(update, program.state_shape)
@@ -172,7 +172,7 @@ def _report_if_finished(session: Session, update: int) -> bool:
     if update >= schedule.num_updates:
         display.say(f"{run_folder.path} is finished; a larger total_steps continues it")
         return True
-    lines = up_to(folder.read_metrics(run_folder, config.num_agents), update)
+    lines = select_until(folder.read_metrics(run_folder, config.num_agents), update)
     solved = is_solved(config.run, results.best_returns(lines))
     if solved:
         display.say(f"{run_folder.path} has reached stop_return={config.run.stop_return:g}; a higher one continues it")
@@ -187,7 +187,7 @@ def _announce_resume(session: Session, update: int, jump: str | None, changed: M
     if jump:
         say(f"note: {jump}")
     for change in changed.items():
-        say(f"note: {versions.described(*change)}")
+        say(f"note: {versions.describe_change(*change)}")
 
 
 def _make_env(config: Config) -> Any:

@@ -8,11 +8,11 @@ from typing import NamedTuple
 import jax
 import numpy as np
 
-from jaxpg.store.names import SHOWN_BESIDE_COMMANDS
+from jaxpg.store.names import STEP_SERIES
 from jaxpg.store.policies import StoredPolicy
 from jaxpg.watch.recording import Look, Recording
 
-STEPS = SHOWN_BESIDE_COMMANDS  # series of every episode
+STEPS = STEP_SERIES  # series of every episode
 
 
 class Clip(NamedTuple):

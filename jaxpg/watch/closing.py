@@ -15,7 +15,7 @@ from jaxpg.run.loop import Session
 from jaxpg.run.session import Times
 from jaxpg.run.terminal import format_metric
 from jaxpg.store import folder, results
-from jaxpg.store.folder import jsonable
+from jaxpg.store.folder import to_json
 from jaxpg.store.statistics import finite_mean
 from jaxpg.watch import figures
 from jaxpg.watch.attempts import attempt
@@ -27,8 +27,8 @@ def show_results(session: Session, times: Times | None) -> None:
     if times is None:
         return
     if config.sweep:
-        display.say(results.heading(config))
-        display.table(results.table(config, lines))
+        display.say(results.make_heading(config))
+        display.table(results.make_table(config, lines))
     path, env = str(session.run_folder.path), config.choices["env"]
     rows = {
         "speed": f"{times.rate:,.0f} steps/s",
@@ -45,7 +45,7 @@ def _evaluated(lines: list[dict[str, Any]]) -> dict[str, str]:
     """What the evaluations say, the last of which is of the end of the run."""
     last = [line for line in lines if "eval_return" in line][-1]
     best = results.best_returns(lines)
-    at_end, at_best = format_metric(last["eval_return"]), format_metric(jsonable(best))
+    at_end, at_best = format_metric(last["eval_return"]), format_metric(to_json(best))
     rows = {"deterministic return": f"{at_end} at the end, {at_best} at best"}
     untrained = np.count_nonzero(~np.isfinite(best))
     if untrained:
@@ -82,7 +82,7 @@ def draw_learning_curve(session: Session) -> list[dict[str, Any]]:
 def _draw_curve(session: Session, lines: list[dict[str, Any]]) -> None:
     config, title, picture = session.config, agents.described(session.config), io.BytesIO()
     if config.sweep:
-        figures.sweep_curves(lines, picture, title, results.curves(config, lines))
+        figures.sweep_curves(lines, picture, title, results.select_curves(config, lines))
     else:
         figures.learning_curve(lines, picture, title)
     folder.replace(session.run_folder.learning_curve, picture.getvalue())

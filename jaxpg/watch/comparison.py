@@ -9,11 +9,11 @@ from typing import Any
 from jaxpg.errors import UserError
 from jaxpg.store import folder, results
 from jaxpg.store.statistics import (
-    fewest_seeds,
     has_interval,
     improvement_interval,
+    min_seeds,
     probability_of_improvement,
-    spread_name,
+    seed_interval_name,
 )
 from jaxpg.watch import publication
 from jaxpg.watch.curves import PANELS, curve, finite
@@ -83,12 +83,12 @@ def columns(found: Sequence[Method]) -> list[str]:
 
 
 def table(found: Sequence[Method]) -> list[list[str]]:
-    """A row for each method: what `columns` says, with several seeds as `results.score` shows them."""
+    """A row for each method: what `columns` says, with several seeds as `results.format_score` shows them."""
     rows = []
     for one in standings(found):
-        rate = "" if one.success is None else results.score(100 * one.success) + " %"
+        rate = "" if one.success is None else results.format_score(100 * one.success) + " %"
         number = str(len(one.method.agents))
-        rows.append([one.method.label, results.score(one.returns), rate, number, f"{one.steps:,}"])
+        rows.append([one.method.label, results.format_score(one.returns), rate, number, f"{one.steps:,}"])
     return rows if _has_success(found) else [[*row[:2], *row[3:]] for row in rows]
 
 
@@ -106,8 +106,8 @@ def notes(found: Sequence[Method]) -> list[str]:
     if apart:
         lines.append(f"not evaluated at {steps:,} steps, but near it: {', '.join(apart)}")
     if any(not has_interval(len(method.agents)) for method in found):
-        around = f"; in parentheses: {spread_name(2)}" if any(_is_few(len(one.agents)) for one in found) else ""
-        lines.append(f"fewer than {fewest_seeds()} seeds carry no 95 % interval{around}")
+        around = f"; in parentheses: {seed_interval_name(2)}" if any(_is_few(len(one.agents)) for one in found) else ""
+        lines.append(f"fewer than {min_seeds()} seeds carry no 95 % interval{around}")
     return lines
 
 

@@ -10,7 +10,7 @@ import numpy as np
 
 from jaxpg.config.configuration import Config
 from jaxpg.store import results
-from jaxpg.store.statistics import interquartile_mean, spread, spread_name
+from jaxpg.store.statistics import interquartile_mean, seed_interval, seed_interval_name
 from jaxpg.watch import figures
 
 Json = dict[str, Any]
@@ -55,7 +55,7 @@ def diagnostics(config: Config, lines: Sequence[Json]) -> list[Json]:
 
 def _agents(config: Config, lines: Sequence[Json], otherwise: str) -> dict[str, slice]:
     """The agents of each curve by its label."""
-    return results.curves(config, lines) if config.sweep else {otherwise: slice(None)}
+    return results.select_curves(config, lines) if config.sweep else {otherwise: slice(None)}
 
 
 def _panel(title: str, series: Sequence[Json]) -> Json:
@@ -68,16 +68,16 @@ def _panel(title: str, series: Sequence[Json]) -> Json:
 
 
 def curve(label: str, steps: np.ndarray, values: np.ndarray) -> Json:
-    """One curve; of several agents, `[S, K]`, their interquartile mean and its `spread`."""
+    """One curve; of several agents, `[S, K]`, their interquartile mean and its `seed_interval`."""
     several = len(values) > 1 and len(steps)
-    low, high = spread(values) if several else (None, None)
+    low, high = seed_interval(values) if several else (None, None)
     return {
         "label": label,
         "steps": steps.tolist(),
         "mean": numbers(interquartile_mean(values)),
         "low": numbers(low) if several else None,
         "high": numbers(high) if several else None,
-        "band": f"{len(values)} seeds, {spread_name(len(values))}" if several else None,
+        "band": f"{len(values)} seeds, {seed_interval_name(len(values))}" if several else None,
     }
 
 

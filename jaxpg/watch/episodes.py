@@ -12,18 +12,18 @@ import envs
 from envs.hints import pip_install
 from jaxpg.errors import UserError
 from jaxpg.evaluation import evaluate
-from jaxpg.store.names import own_metrics
+from jaxpg.store.names import rename_metrics
 from jaxpg.store.policies import StoredPolicy
-from jaxpg.store.statistics import counted_returns
+from jaxpg.store.statistics import penalize_diverged
 
 
 class Results(NamedTuple):
     """N episodes.
 
     Attributes:
-      returns: at what they count (`counted_returns`), `[N]`.
+      returns: at what they count (`penalize_diverged`), `[N]`.
       diverged: whether the physics did, `[N]` of bool.
-      metrics: the environment's, of the last step, `[N]` by their names among ours (`own_metrics`).
+      metrics: the environment's, of the last step, `[N]` by their names among ours (`rename_metrics`).
     """
 
     returns: np.ndarray
@@ -40,8 +40,8 @@ def play_own(stored: StoredPolicy, num_episodes: int, seed: int) -> Results:
         return evaluate(stored.env, act, jax.random.split(key, num_episodes), stored.config.env.episode_length)
 
     episodes = jax.tree.map(np.asarray, play(stored.policy, jax.random.key(seed)))
-    returns = counted_returns(episodes.episode_return, episodes.diverged)
-    return Results(returns, episodes.diverged, own_metrics(episodes.metrics))
+    returns = penalize_diverged(episodes.episode_return, episodes.diverged)
+    return Results(returns, episodes.diverged, rename_metrics(episodes.metrics))
 
 
 def play_gymnasium(stored: StoredPolicy, num_episodes: int, seed: int) -> Results:

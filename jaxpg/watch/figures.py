@@ -7,7 +7,7 @@ from typing import Any, BinaryIO
 
 import numpy as np
 
-from jaxpg.store.statistics import interquartile_mean, spread, spread_name
+from jaxpg.store.statistics import interquartile_mean, seed_interval, seed_interval_name
 
 # Of the curves, as on the page of the run (jaxpg/watch/page/page.css), so that a colour means the same in both.
 COLORS = ("#0072b2", "#d55e00", "#009e73", "#b35c93", "#c78500", "#3f9fd8", "#4a525c")
@@ -17,7 +17,7 @@ def learning_curve(lines: Sequence[dict[str, Any]], file: BinaryIO, title: str) 
     """Return, and success where there is one, over environment steps.
 
     Args:
-      lines: of `metrics.jsonl`; values of several agents are lists, drawn as their interquartile mean and `spread`.
+      lines: of `metrics.jsonl`; lists, one value per agent, are drawn as interquartile mean and `seed_interval`.
       file: takes the PNG.
       title: above the picture.
     """
@@ -43,7 +43,7 @@ def sweep_curves(lines: Sequence[dict[str, Any]], file: BinaryIO, title: str, se
             _draw(axes, *series(lines, name, agents), label)
     number = max(agents.stop - agents.start for agents in settings.values())
     handles, labels = panels["eval_return"].get_legend_handles_labels()
-    title = f"interquartile mean of {number} seeds,\n{spread_name(number)}" if number > 1 else None
+    title = f"interquartile mean of {number} seeds,\n{seed_interval_name(number)}" if number > 1 else None
     legend = figure.legend(handles, labels, loc="outside right center", title=title, fontsize=8, title_fontsize=8)
     # Beside the panels, which keep their size.
     figure.set_figwidth(figure.get_figwidth() + legend.get_window_extent().width / figure.dpi)
@@ -77,15 +77,15 @@ def series(lines: Sequence[dict[str, Any]], name: str, agents: slice = slice(Non
 
 
 def draw_curve(axes: Any, steps: np.ndarray, values: np.ndarray, label: str) -> None:
-    """One curve; of several agents their interquartile mean with its `spread`."""
+    """One curve; of several agents their interquartile mean with its `seed_interval`."""
     _draw(axes, steps, values, f"{label}: {_of_seeds(len(values))}" if len(values) > 1 and len(steps) else label)
 
 
 def _draw(axes: Any, steps: np.ndarray, values: np.ndarray, label: str) -> None:
     (line,) = axes.plot(steps, interquartile_mean(values), label=label)
     if len(values) > 1 and len(steps):
-        axes.fill_between(steps, *spread(values), color=line.get_color(), alpha=0.2, linewidth=0)
+        axes.fill_between(steps, *seed_interval(values), color=line.get_color(), alpha=0.2, linewidth=0)
 
 
 def _of_seeds(number: int) -> str:
-    return f"interquartile mean of {number} seeds, {spread_name(number)}"
+    return f"interquartile mean of {number} seeds, {seed_interval_name(number)}"

@@ -12,9 +12,9 @@ from jaxpg.run.loop import is_solved
 from jaxpg.run.terminal import format_metric
 from jaxpg.store import config_file, folder, lock, same_run, versions
 from jaxpg.store.checkpoint import CheckpointError, Checkpoints
-from jaxpg.store.folder import RunFolder, jsonable
-from jaxpg.store.lines import up_to
-from jaxpg.store.results import best_returns, table
+from jaxpg.store.folder import RunFolder, to_json
+from jaxpg.store.lines import select_until
+from jaxpg.store.results import best_returns, make_table
 
 
 class Inspection(NamedTuple):
@@ -63,7 +63,7 @@ def inspect(path: str) -> Inspection:
     sound = [number for number, problem in checkpoints.items() if problem is None]
     update = sound[0] if sound else 0
     schedule = plan(config)
-    best_of_checkpoint = best_returns(up_to(lines, update))
+    best_of_checkpoint = best_returns(select_until(lines, update))
     before = folder.read_versions(run_folder)
     return Inspection(
         run_folder=run_folder,
@@ -72,10 +72,10 @@ def inspect(path: str) -> Inspection:
         update=update,
         schedule=schedule,
         finished=bool(sound) and (update >= schedule.num_updates or is_solved(config.run, best_of_checkpoint)),
-        owner=lock.owner(run_folder.path),
+        owner=lock.find_owner(run_folder.path),
         digest=stored.digest(update) if sound else None,
         lines=lines,
-        changed=versions.changes(before, versions.versions()),
+        changed=versions.find_changes(before, versions.collect_versions()),
         earlier=len(before.get("earlier", [])),
     )
 
@@ -122,10 +122,10 @@ def _returns(found: Inspection) -> dict[str, str]:
     evaluations = [line["eval_return"] for line in found.lines if "eval_return" in line]
     if not evaluations:
         return {}
-    best = jsonable(best_returns(found.lines))
+    best = to_json(best_returns(found.lines))
     rows = {"return": f"{format_metric(evaluations[-1])} at the last evaluation, {format_metric(best)} at best"}
     if found.config.sweep:
-        setting, score = next(iter(table(found.config, found.lines).items()))
+        setting, score = next(iter(make_table(found.config, found.lines).items()))
         rows["best setting"] = f"{setting}: {score}"
     return rows
 

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from jaxpg.store.statistics import has_interval, interquartile_mean, spread, spread_name
+from jaxpg.store.statistics import has_interval, interquartile_mean, seed_interval, seed_interval_name
 from jaxpg.watch.curves import PANELS
 from jaxpg.watch.figures import COLORS
 from jaxpg.watch.methods import Method, standings
@@ -33,7 +33,7 @@ def figure(found: Sequence[Method], form: str) -> bytes:
     """The learning curves as a vector figure with its fonts in it, readable without colours.
 
     Args:
-      found: the methods; several seeds are drawn as their interquartile mean and `spread`.
+      found: the methods; several seeds are drawn as their interquartile mean and `seed_interval`.
       form: "pdf" or "svg".
     """
     import matplotlib
@@ -70,9 +70,9 @@ def _draw_method(axes: Any, i: int, label: str, steps: np.ndarray, values: np.nd
         markersize=3,
         linewidth=1.2,
     )
-    line.set_label(f"{label}\n({number} seeds, {spread_name(number)})" if number > 1 else f"{label} (1 seed)")
+    line.set_label(f"{label}\n({number} seeds, {seed_interval_name(number)})" if number > 1 else f"{label} (1 seed)")
     if number > 1:
-        axes.fill_between(steps, *spread(values), color=color, alpha=0.15, linewidth=0)
+        axes.fill_between(steps, *seed_interval(values), color=color, alpha=0.15, linewidth=0)
 
 
 def csv_table(found: Sequence[Method]) -> str:
@@ -94,5 +94,5 @@ def _with_interval(values: np.ndarray | None) -> list[float | str]:
     """Interquartile mean, lower and upper end."""
     if values is None:
         return ["", "", ""]
-    ends = [float(end) for end in spread(values)] if has_interval(len(values)) else ["", ""]
+    ends = [float(end) for end in seed_interval(values)] if has_interval(len(values)) else ["", ""]
     return [float(interquartile_mean(values)), *ends]

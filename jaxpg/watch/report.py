@@ -19,7 +19,7 @@ from jaxpg.store import config_file, folder, policies, results
 from jaxpg.store.cache import compilation_cache, physics_cache
 from jaxpg.store.folder import RunFolder
 from jaxpg.store.policies import StoredPolicy
-from jaxpg.store.statistics import counted_returns
+from jaxpg.store.statistics import penalize_diverged
 from jaxpg.watch.attempts import attempt
 from jaxpg.watch.clips import limits_of
 from jaxpg.watch.curves import curves, diagnostics, finite
@@ -57,9 +57,9 @@ def of_run(path: str, agent: int | None, cache: bool, say: Callable[[str], None]
     with physics_cache(cache), compilation_cache(cache, say):
         best, last = policies.load_several(path, ["best", "last"], agent)
         stages = {UNTRAINED: untrained(best)}
-        if best.evaluated:
+        if best.has_evaluation:
             stages["best"] = best
-        if last.update != best.update or not best.evaluated:
+        if last.update != best.update or not best.has_evaluation:
             stages["last"] = last
         data = report(run_folder, config_file.load(run_folder.config), stages)
     content = page(data)
@@ -119,7 +119,7 @@ def _progress(config: Config, lines: Sequence[Json]) -> list[list[str]]:
     rows = [["trained", f"{last['steps']:,} steps in {last['seconds']:.1f} s, {last['update']:,} updates"]]
     evaluated = [line for line in lines if "eval_return" in line]
     if evaluated and config.num_agents > 1:
-        best = format_metric(folder.jsonable(results.best_returns(lines)))
+        best = format_metric(folder.to_json(results.best_returns(lines)))
         mean = f"{format_metric(evaluated[-1]['eval_return'])} at the last evaluation, {best} at the best of each"
         rows.append([f"mean return of {config.num_agents} agents", mean])
     return rows
@@ -158,7 +158,7 @@ def _measured(label: str, stage: StoredPolicy, recording: Recording) -> dict[str
 
 def _earned(recording: Recording) -> str:
     """Mean return and its standard error."""
-    returns = counted_returns(recording.episode_return, recording.diverged)
+    returns = penalize_diverged(recording.episode_return, recording.diverged)
     if not np.isfinite(returns).all():
         return "n/a"
     mean = f"{returns.mean():.1f}"
@@ -180,7 +180,7 @@ def _references(
         found["stop_return"] = config.run.stop_return
     for label, recording in zip(stages, recordings or [], strict=False):
         if label == UNTRAINED:
-            found[label] = float(counted_returns(recording.episode_return, recording.diverged).mean())
+            found[label] = float(penalize_diverged(recording.episode_return, recording.diverged).mean())
     return {label: value for label, value in found.items() if math.isfinite(value)}
 
 
@@ -204,7 +204,12 @@ def _versions(run_folder: RunFolder) -> list[list[str]]:
 def _settings(config: Config, lines: Sequence[Json]) -> list[Json]:
     if not config.sweep:
         return []
-    rows = [[setting, score] for setting, score in results.table(config, lines).items()]
+    rows = [[setting, score] for setting, score in results.make_table(config, lines).items()]
     return [
-        {"title": results.heading(config).rstrip(":"), "columns": ["setting", "return"], "rows": rows, "note": None}
+        {
+            "title": results.make_heading(config).rstrip(":"),
+            "columns": ["setting", "return"],
+            "rows": rows,
+            "note": None,
+        }
     ]
