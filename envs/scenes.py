@@ -1,8 +1,8 @@
-"""How the states of an environment look: for videos and reports, never for training.
+"""How the states of an environment look: for videos and reports, not for training.
 
-An environment that can be looked at has a `scene`; brax's own have a MuJoCo model too. One whose state is a point of a
-plane may have a `phase_plane`, over which a value function is drawn as a map. One that knows what a return is worth may
-have `references`: returns by what they are, such as `{"best possible": -137.4}`.
+All three attributes are optional. `scene` shows the robot; brax's own environments have a MuJoCo model instead. An
+environment whose state is a point in a plane may have a `phase_plane`, over which the value function is drawn as a map.
+`references` are returns to compare with, by label, such as `{"best possible": -137.4}`.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ class PhasePlane(NamedTuple):
     observe: Callable[[jax.Array, jax.Array], jax.Array]
 
 
-def scene(env: Any) -> Scene | None:
+def find_scene(env: Any) -> Scene | None:
     """How the states of `env` look; None where there is nothing to be seen, as of the quadratic problem."""
     if hasattr(env, "scene"):
         return env.scene
@@ -55,6 +55,6 @@ def scene(env: Any) -> Scene | None:
     return Scene(model, lambda state: state.pipeline_state.q) if model is not None else None
 
 
-def references(env: Any) -> Mapping[str, float]:
+def find_references(env: Any) -> Mapping[str, float]:
     """Returns to compare with, by what they are; empty where the environment knows none."""
     return getattr(env, "references", {})

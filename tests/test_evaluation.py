@@ -182,10 +182,10 @@ def test_what_is_no_number_is_said_in_words():
 
 def test_of_several_agents_it_is_said_how_many_have_the_untrained_policy():
     lines = [{"eval_return": [None, 1.0, 2.0], "eval_diverged": [8, 0, 1]}]
-    rows = closing._evaluated(lines)
+    rows = closing._summarize_evaluations(lines)
     assert rows["best policy"].startswith("the untrained one of 1 of the 3 agents: ")
     assert rows["diverged"] == "9 episodes of the last evaluation"
-    assert "best policy" not in closing._evaluated([{"eval_return": [1.0, 2.0]}])
+    assert "best policy" not in closing._summarize_evaluations([{"eval_return": [1.0, 2.0]}])
 
 
 def test_a_run_all_of_whose_episodes_diverge_calls_no_policy_best(program, tmp_path):

@@ -79,7 +79,7 @@ def without_a_logger(monkeypatch):
 
 def without_av(monkeypatch):
     monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
-    movie.chosen(Path("video.mp4"))
+    movie.find_format(Path("video.mp4"))
 
 
 def without_playground(monkeypatch):

@@ -17,7 +17,7 @@ from envs.options import option
 from jaxpg import evaluate, train
 from jaxpg.store import policies
 from jaxpg.store.names import RESERVED, number_duplicates, rename_interface, rename_metrics
-from jaxpg.watch.clips import clip
+from jaxpg.watch.clips import make_clip
 from jaxpg.watch.recording import record
 
 NAMES = st.lists(st.one_of(st.sampled_from(sorted(RESERVED)), st.text(max_size=150), st.just("env_return")), max_size=8)
@@ -120,7 +120,7 @@ def test_the_evaluation_shows_both(run, capsys):
 def test_commands_with_one_name_are_a_series_each(run):
     stored = policies.load(str(run))
     (recording,) = record(stored, [stored.policy], jax.random.split(jax.random.key(0), 2))
-    series = clip(stored, recording, 0).series
+    series = make_clip(stored, recording, 0).series
     assert list(series) == ["torque (1)", "torque (2)", "reward (3)", "reward", "value"]
     for i, name in enumerate(["torque (1)", "torque (2)", "reward (3)"]):
         np.testing.assert_array_equal(series[name], recording.command[:4, 0, i])

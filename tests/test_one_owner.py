@@ -47,7 +47,7 @@ def test_a_run_in_use_has_one_owner(command, command_environment, tmp_path):
             result = command("train", *arguments)
             assert (result.returncode, result.stdout) == (2, "")
             assert result.stderr == f"error: {folder} is in use by {name}, which is training in it\n"
-        assert f"just now, by {name}" in command("inspect", f"run={folder}").stdout
+        assert f"now, by {name}" in command("inspect", f"run={folder}").stdout
         assert tree(folder) == before
         process.send_signal(signal.SIGKILL)
         process.wait()

@@ -6,7 +6,7 @@ import pytest
 from jaxpg.config.parsing import compose
 from jaxpg.store.results import MAX_CURVES, MAX_ROWS, best_returns, make_heading, make_table, rank, select_curves
 from jaxpg.store.statistics import bootstrap_interval, interquartile_mean
-from jaxpg.watch.figures import sweep_curves
+from jaxpg.watch.figures import draw_sweep_curves
 
 CONFIG = compose(["num_seeds=4", "sweep.algo.gamma=[0.5,0.75,1]"])
 FIRST = [1.0, 2.0, 3.0, None, 7.0, 5.0, 6.0, 8.0, 0.0, 0.0, 0.0, 0.0]
@@ -78,5 +78,5 @@ def test_equal_settings_keep_their_order():
 
 @pytest.mark.parametrize("lines", [LINES, [line | {"eval_success": [0.5] * 12} for line in LINES]])
 def test_a_sweep_is_drawn_where_a_setting_has_diverged(lines, tmp_path):
-    sweep_curves(lines, tmp_path / "curves.png", "title", select_curves(CONFIG, lines))
+    draw_sweep_curves(lines, tmp_path / "curves.png", "title", select_curves(CONFIG, lines))
     assert (tmp_path / "curves.png").read_bytes().startswith(b"\x89PNG")

@@ -31,7 +31,7 @@ def main(arguments: Sequence[str]) -> int:
         changes |= _make_mujoco_changes(options.run)
     with physics_cache(options.cache):
         stored = policies.load(options.run, options.checkpoint, options.agent, changes)
-    play = episodes.play_gymnasium if options.backend == "gymnasium" else episodes.play_own
+    play = episodes.play_gymnasium if options.backend == "gymnasium" else episodes.play_mjx
     with _choose_player(stored, options.policy) as player, compilation_cache(options.cache, print):
         results = play(player, options.episodes, options.seed)
     how = options.backend if options.policy == "jax" else f"{options.backend}, as {options.policy}"

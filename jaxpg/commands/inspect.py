@@ -16,5 +16,5 @@ def main(arguments: Sequence[str]) -> int:
         from jaxpg.watch import inspection
 
         result = inspection.inspect(options.run)
-        print(json.dumps(inspection.summary(result)) if options.json else inspection.described(result))
+        print(json.dumps(inspection.summarize(result)) if options.json else inspection.describe(result))
     return 0

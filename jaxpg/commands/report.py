@@ -12,7 +12,7 @@ def main(arguments: Sequence[str]) -> int:
     """The report command; returns its exit status."""
     options = parse_run_options("report", ReportOptions, arguments)
     if options is not None:
-        from jaxpg.watch import report
+        from jaxpg.watch import run_page
 
-        report.of_run(options.run, options.agent, options.cache, print)
+        run_page.write_report(options.run, options.agent, options.cache, print)
     return 0
