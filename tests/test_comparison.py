@@ -212,12 +212,12 @@ def test_success_is_shown_where_there_is_one(run):
 @pytest.mark.parametrize(
     ("runs", "message"),
     [
-        ([("a", "env=arm"), ("b", "env=pendulum")], "can be compared: arm in .*a; pendulum in .*b"),
+        ([("a", "env=arm"), ("b", "env=pendulum")], "can only be compared in the same environment: arm in .*a; pendulum in .*b"),
         (
             [("a", "env=brax"), ("b", "env=brax", "env.name=ant")],
-            "of one environment can be compared: ant in .*b; inverted_pendulum in .*a",
+            "in the same environment: ant in .*b; inverted_pendulum in .*a",
         ),
-        ([("a", "seed=1"), ("b", "seed=1")], "seed 1 is there twice"),
+        ([("a", "seed=1"), ("b", "seed=1")], "seed 1 occurs twice"),
         ([("a", "seed=1"), ("none", "seed=2")], "its runs have no evaluation in common"),
     ],
 )

@@ -43,7 +43,7 @@ FILES = {
 def test_the_users_files_stay(form, export, tmp_path):
     for name in FILES[form]:
         (tmp_path / name).write_text("mine")
-        with pytest.raises(UserError, match=rf"holds {name}, not written by an export, or changed since: nothing is"):
+        with pytest.raises(UserError, match=rf"holds {name}, not written by an export or changed since: nothing is"):
             export(f"format={form}", f"out={tmp_path}")
         assert [(path.name, path.read_text()) for path in tmp_path.iterdir()] == [(name, "mine")]
         (tmp_path / name).unlink()
@@ -249,7 +249,7 @@ def test_limits_of_any_sequence(limits, tmp_path):
         (Interface(("x", "y"), ("u",), (1.0,)), r"interface\.observations has 2 entries, expected 1"),
         (Interface(("x",), (), (1.0,)), r"interface\.commands has 0 entries"),
         (Interface(("x",), ("u",), (1.0, 2.0)), r"interface\.limits has 2 entries"),
-        (Interface(("x",), ("u",), (np.nan,)), "in its limits are numbers that are not finite"),
+        (Interface(("x",), ("u",), (np.nan,)), "its limits contain numbers that are not finite"),
     ],
 )
 def test_an_interface_that_does_not_fit_is_one_line(interface, message):
@@ -260,5 +260,5 @@ def test_an_interface_that_does_not_fit_is_one_line(interface, message):
 def test_a_policy_of_nan_is_one_line():
     stored = a_policy(*OPTIONS)
     normalizer = stored.policy.normalizer._replace(mean=np.array([np.nan], np.float32))
-    with pytest.raises(UserError, match="in its observation statistics are numbers that are not finite"):
+    with pytest.raises(UserError, match="its observation statistics contain numbers that are not finite"):
         make_controller(stored._replace(policy=stored.policy._replace(normalizer=normalizer)), {})

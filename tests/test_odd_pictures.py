@@ -205,7 +205,7 @@ def test_what_cannot_be_drawn_is_left_out_and_said_and_the_rest_stands(shown, at
 
 
 def test_a_critic_that_is_no_number_somewhere_has_no_portrait(shown, monkeypatch):
-    monkeypatch.setattr(player, "value_map", lambda *_: [np.full((3, 3), math.nan)])
+    monkeypatch.setattr(player, "compute_value_map", lambda *_: [np.full((3, 3), math.nan)])
     data = shown(phase_plane=plane())
     assert data["notes"] == ["no phase portrait: the critic's values are not finite everywhere"]
     assert data["player"]["policies"][0]["episodes"][0]["path"]
@@ -215,7 +215,7 @@ def test_a_bug_is_one_note_for_users_and_raised_for_whoever_asks(shown, monkeypa
     def broken(*_):
         raise KeyError("nothing of this name")
 
-    monkeypatch.setattr(run_page, "diagnostics", broken)
+    monkeypatch.setattr(run_page, "make_diagnostics", broken)
     monkeypatch.setenv(attempts.RAISE, "1")
     with pytest.raises(KeyError):
         shown()
