@@ -14,13 +14,13 @@ import jax
 
 
 class Scene(NamedTuple):
-    """A MuJoCo model, and how it stands in a state.
+    """A MuJoCo model, and its pose in a state.
 
     Attributes:
       model: `mujoco.MjModel`.
       qpos: `qpos(State) -> [nq]`, the joint positions.
-      goal: `goal(State) -> [3]`, where the robot should get [m]; None where there is no such place.
-      goal_radius: how near is near enough [m]; None without a goal.
+      goal: `goal(State) -> [3]`, the place that the robot should reach [m]; None if there is none.
+      goal_radius: distance that counts as reached [m]; None without a goal.
     """
 
     model: Any
@@ -30,13 +30,13 @@ class Scene(NamedTuple):
 
 
 class PhasePlane(NamedTuple):
-    """Two coordinates x, y that say all of a state.
+    """Two coordinates x, y that determine a state.
 
     Attributes:
       labels: their names and units.
       ranges: lower and upper end of each.
-      wraps: whether the ends of the range are the same state, of each.
-      coordinates: `coordinates(State) -> [2]`; what wraps may be out of its range.
+      wraps: for each, whether both ends of the range are the same state.
+      coordinates: `coordinates(State) -> [2]`; a coordinate that wraps may be out of its range.
       observe: `observe(x, y) -> obs`.
     """
 
@@ -48,7 +48,7 @@ class PhasePlane(NamedTuple):
 
 
 def find_scene(env: Any) -> Scene | None:
-    """How the states of `env` look; None where there is nothing to be seen, as of the quadratic problem."""
+    """How the states of `env` look; None if it cannot be drawn, like the quadratic problem."""
     if hasattr(env, "scene"):
         return env.scene
     model = getattr(getattr(env, "sys", None), "mj_model", None)  # brax's
@@ -56,5 +56,5 @@ def find_scene(env: Any) -> Scene | None:
 
 
 def find_references(env: Any) -> Mapping[str, float]:
-    """Returns to compare with, by what they are; empty where the environment knows none."""
+    """Returns to compare with, by label; empty if the environment has none."""
     return getattr(env, "references", {})

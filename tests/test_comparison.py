@@ -212,7 +212,10 @@ def test_success_is_shown_where_there_is_one(run):
 @pytest.mark.parametrize(
     ("runs", "message"),
     [
-        ([("a", "env=arm"), ("b", "env=pendulum")], "can only be compared in the same environment: arm in .*a; pendulum in .*b"),
+        (
+            [("a", "env=arm"), ("b", "env=pendulum")],
+            "can only be compared in the same environment: arm in .*a; pendulum in .*b",
+        ),
         (
             [("a", "env=brax"), ("b", "env=brax", "env.name=ant")],
             "in the same environment: ant in .*b; inverted_pendulum in .*a",

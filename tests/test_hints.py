@@ -40,7 +40,7 @@ def interpreter(monkeypatch, tmp_path):
 )
 def test_the_interpreter_as_the_shell_finds_it(interpreter, path, typed):
     interpreter(path)
-    assert hints.python() == typed
+    assert hints.python_command() == typed
     assert subprocess.run(f"{typed} -c 'print(7)'", shell=True, capture_output=True, check=True).stdout == b"7\n"
 
 

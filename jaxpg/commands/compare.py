@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
-from envs.hints import python
+from envs.hints import python_command
 from envs.options import build
 from jaxpg.commands.options import print_help_if_asked
 from jaxpg.config import parsing
@@ -22,7 +22,7 @@ def main(arguments: Sequence[str]) -> int:
     folders = [argument for argument in arguments if "=" not in argument or Path(argument).is_dir()]
     options = build(CompareOptions, parsing.parse([argument for argument in arguments if argument not in folders]))
     if not folders:
-        raise UserError(f"run folders are missing: {python()} -m jaxpg.compare runs/a runs/b")
+        raise UserError(f"run folders are missing: {python_command()} -m jaxpg.compare runs/a runs/b")
     comparison.write(_select_runs(folders, print), Path(options.out), print)
     return 0
 
