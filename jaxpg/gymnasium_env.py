@@ -99,7 +99,7 @@ class Batch(gymnasium.vector.VectorEnv):
           options: may have `reset_mask`, `[N]` of bool: only these environments are reset. Others are ignored.
         """
         mask = np.asarray((options or {}).get("reset_mask", np.ones(self.num_envs, bool)))
-        seeds = self._seeds_of_each(seed)
+        seeds = self._expand_seeds(seed)
         for i in np.flatnonzero(mask):
             if seeds[i] is not None:
                 self._generators[i], _ = seeding.np_random(seeds[i])
@@ -124,7 +124,7 @@ class Batch(gymnasium.vector.VectorEnv):
         info |= {f"_{name}": ~begins for name in info}  # Gymnasium's mask of the environments that report it
         return _to_observation(state), np.array(state.reward, np.float64), terminated, truncated, info
 
-    def _seeds_of_each(self, seed: int | Sequence[int | None] | None) -> list[int | None]:
+    def _expand_seeds(self, seed: int | Sequence[int | None] | None) -> list[int | None]:
         if seed is None:
             return [None] * self.num_envs
         seeds = [seed + i for i in range(self.num_envs)] if isinstance(seed, (int, np.integer)) else list(seed)
@@ -134,8 +134,8 @@ class Batch(gymnasium.vector.VectorEnv):
 
     def _start_seeds(self, mask: np.ndarray, seeds: Sequence[int | None]) -> np.ndarray:
         """`draw_seed` of each environment of the mask, `[N]`; 0 for the others."""
-        each = zip(mask, seeds, self._generators, strict=True)
-        return np.array([draw_seed(seed, random) if wanted else 0 for wanted, seed, random in each], np.uint32)
+        triples = zip(mask, seeds, self._generators, strict=True)
+        return np.array([draw_seed(seed, random) if wanted else 0 for wanted, seed, random in triples], np.uint32)
 
 
 class EnvFunctions(NamedTuple):

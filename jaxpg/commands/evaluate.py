@@ -31,11 +31,11 @@ def main(arguments: Sequence[str]) -> int:
         changes |= _make_mujoco_changes(options.run)
     with physics_cache(options.cache):
         stored = policies.load(options.run, options.checkpoint, options.agent, changes)
-    play = episodes.play_gymnasium if options.backend == "gymnasium" else episodes.play_mjx
+    play = episodes.play_gymnasium if options.backend == "gymnasium" else episodes.play_native
     with _choose_player(stored, options.policy) as player, compilation_cache(options.cache, print):
         results = play(player, options.episodes, options.seed)
     how = options.backend if options.policy == "jax" else f"{options.backend}, as {options.policy}"
-    print(f"{stored.config.task}, {stored.agent}, {stored.described(options.checkpoint)}, {how}")
+    print(f"{stored.config.task}, {stored.agent}, {stored.describe(options.checkpoint)}, {how}")
     for name, value in _format_results(results).items():
         print(f"{name:<8} {value}")
     if options.json:

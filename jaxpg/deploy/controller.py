@@ -200,8 +200,8 @@ def to_physical(interface: Interface, action: jax.Array) -> jax.Array:
 
 def collect_observations(stored: StoredPolicy) -> np.ndarray:
     """Test observations, `[10000, n]`: some from episodes that the controller plays, the others random."""
-    seen = play_observations(stored)
-    return np.concatenate([seen, draw_observations(stored, seen)])
+    played = play_observations(stored)
+    return np.concatenate([played, draw_observations(stored, played)])
 
 
 def play_observations(stored: StoredPolicy) -> np.ndarray:
@@ -214,28 +214,28 @@ def play_observations(stored: StoredPolicy) -> np.ndarray:
     keys = jax.random.split(jax.random.key(0), NUM_EPISODES)
 
     @jax.jit
-    def seen_by(policy):
+    def play_episodes(policy):
         act = functools.partial(stored.act, policy)
         return play(stored.env, act, keys, length, lambda step: (step.before.obs, step.alive))[1]
 
-    obs, alive = (np.asarray(x) for x in seen_by(stored.policy))
-    seen = obs[alive].astype(np.float32)
+    obs, alive = (np.asarray(x) for x in play_episodes(stored.policy))
+    visited = obs[alive].astype(np.float32)
     if not stored.policy.normalizer.count:
-        return seen[np.all(np.abs(seen) <= MAX_DEVIATION, axis=1)]
+        return visited[np.all(np.abs(visited) <= MAX_DEVIATION, axis=1)]
     mean, deviation = _training_statistics(stored)
     last_digits = 1e-6 * np.abs(mean)  # a constant's mean differs from it by these
-    return seen[np.all(np.abs(seen - mean) <= MAX_PLAYED_DEVIATION * deviation + last_digits, axis=1)]
+    return visited[np.all(np.abs(visited - mean) <= MAX_PLAYED_DEVIATION * deviation + last_digits, axis=1)]
 
 
-def draw_observations(stored: StoredPolicy, seen: np.ndarray) -> np.ndarray:
-    """Random observations around training's mean with twice its deviation; as many as complete `seen` to 10,000.
+def draw_observations(stored: StoredPolicy, played: np.ndarray) -> np.ndarray:
+    """Random observations around training's mean with twice its deviation; as many as complete `played` to 10,000.
 
-    Without normalization in training, mean and deviation are those of `seen`, unless it is empty.
+    Without normalization in training, mean and deviation are those of `played`, unless it is empty.
     """
     mean, deviation = _training_statistics(stored)
-    if not stored.policy.normalizer.count and len(seen):
-        mean, deviation = seen.mean(axis=0), seen.std(axis=0)
-    noise = np.asarray(jax.random.normal(jax.random.key(1), (NUM_OBSERVATIONS - len(seen), len(mean))))
+    if not stored.policy.normalizer.count and len(played):
+        mean, deviation = played.mean(axis=0), played.std(axis=0)
+    noise = np.asarray(jax.random.normal(jax.random.key(1), (NUM_OBSERVATIONS - len(played), len(mean))))
     return (mean + 2 * deviation * noise).astype(np.float32)
 
 

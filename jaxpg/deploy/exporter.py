@@ -119,17 +119,17 @@ def export(options: ExportOptions, say: Callable[[str], None]) -> None:
     _describe_trial(control, trial, len(played), say)
     say(f"{'jax':<10} error {_check_error(control, 'jax', trial, np.asarray(command(trial.obs))):.1e} at most")
     with tempfile.TemporaryDirectory() as place:
-        written = []
+        all_paths = []
         for name, target in formats.items():
             paths = target.write(control, Path(place), command)
             error = _check_error(control, f"format={name}", trial, target.load(control, Path(place))(trial.obs))
-            written += paths
+            all_paths += paths
             say(f"{name:<10} error {error:.1e} at most: {' '.join(str(out / path.name) for path in paths)}")
             if name == "c" and control.learner:
                 say(f"{'':<10} {_check_learner(stored, control, Path(place))}")
         if not options.overwrite:
-            sealing.check_replaceable([path.name for path in written], out)
-        sealing.move_into(written, out)
+            sealing.check_replaceable([path.name for path in all_paths], out)
+        sealing.move_into(all_paths, out)
 
 
 def _describe_trial(control: Controller, trial: Trial, num_played: int, say: Callable[[str], None]) -> None:
@@ -219,7 +219,7 @@ def describe_origin(options: ExportOptions, stored: StoredPolicy) -> dict[str, s
     run_folder = folder.find(options.run)
     which = run_folder.best if options.checkpoint == "best" else run_folder.checkpoints
     return {
-        "policy": f"{described(stored.config)}, {stored.described(options.checkpoint)}",
+        "policy": f"{described(stored.config)}, {stored.describe(options.checkpoint)}",
         "run": run_folder.path.resolve().name,
         "digest": Checkpoints(which, read_only=True).digest(stored.update),
     }

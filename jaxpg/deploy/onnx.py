@@ -58,8 +58,13 @@ def write(controller: Controller, folder: Path) -> list[Path]:
     model = helper.make_model(body, opset_imports=[helper.make_opsetid("", OPSET)], producer_name="jaxpg")
     model.ir_version = IR_VERSION
     names, commands, limits = controller.interface
-    about = {"observations": "; ".join(names), "commands": "; ".join(commands), "limits": str(limits), "seal": NO_SEAL}
-    helper.set_model_props(model, controller.origin | about)
+    metadata = {
+        "observations": "; ".join(names),
+        "commands": "; ".join(commands),
+        "limits": str(limits),
+        "seal": NO_SEAL,
+    }
+    helper.set_model_props(model, controller.origin | metadata)
     checker.check_model(model, full_check=True)
     path = folder / f"{controller.name}.onnx"
     path.write_bytes(add_seal(model.SerializeToString()))
@@ -105,15 +110,15 @@ def _add_layer(graph: Graph, x: str, layer: Any) -> str:
 
 
 def _polynomial(graph: Graph, z: str, controller: Controller) -> str:
-    size, before = controller.observation_size, [(i,) for i in range(controller.observation_size)]
+    size, terms = controller.observation_size, [(i,) for i in range(controller.observation_size)]
     degrees = [z]
     for degree in range(2, controller.order + 1):
-        place, before = (
-            {c: i for i, c in enumerate(before)},
+        place, terms = (
+            {c: i for i, c in enumerate(terms)},
             [*itertools.combinations_with_replacement(range(size), degree)],
         )
-        rest = graph.columns(degrees[-1], [place[c[:-1]] for c in before])
-        degrees.append(graph.node("Mul", rest, graph.columns(z, [c[-1] for c in before])))
+        rest = graph.columns(degrees[-1], [place[c[:-1]] for c in terms])
+        degrees.append(graph.node("Mul", rest, graph.columns(z, [c[-1] for c in terms])))
     return graph.node("Concat", *degrees, axis=1)
 
 

@@ -90,11 +90,11 @@ class Loop:
         with self._watchdog.chunk(f"update {self.update + 1:,} to {self.update + number:,}"):
             train, metrics = jax.block_until_ready(self._program.advance(self._state.train, number))
         self.monitor.observe(self._state.train, metrics)
-        made = count_updates(train) - self.update
-        if made:
-            self._state, self.update = self._state._replace(train=train), self.update + made
-            self._write({name: x[:, :made] for name, x in metrics.items()})
-        return made > 0
+        count = count_updates(train) - self.update
+        if count:
+            self._state, self.update = self._state._replace(train=train), self.update + count
+            self._write({name: x[:, :count] for name, x in metrics.items()})
+        return count > 0
 
     def _write(self, metrics: Metrics) -> None:
         """Writes the line of metrics, with an evaluation if one is due."""

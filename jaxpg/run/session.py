@@ -153,16 +153,16 @@ def _continue(stored: Config, config: Config, finish: Finish, run_folder: RunFol
     if _report_if_finished(session, update):
         finish(session, None)
         return 0
-    now = versions.collect_versions()
-    changed = versions.find_changes(recorded_versions, now)
-    _announce_resume(session, update, described_jump(stored, config, update), changed)
+    current_versions = versions.collect_versions()
+    changes = versions.find_changes(recorded_versions, current_versions)
+    _announce_resume(session, update, described_jump(stored, config, update), changes)
     program, seconds = _compile(session, _make_env(config), resumed=True)
     state = checkpoints.restore(update, program.state_shape)
     if config.run.nan_policy == "skip":
         state = state._replace(train=_align_updates(state.train))
     folder.replace(run_folder.config, configuration.to_yaml(config))
-    if changed:
-        folder.change_versions(run_folder, recorded_versions, now)
+    if changes:
+        folder.change_versions(run_folder, recorded_versions, current_versions)
     return _train(session, finish, program, state, seconds)
 
 
@@ -179,14 +179,14 @@ def _report_if_finished(session: Session, update: int) -> bool:
     return solved
 
 
-def _announce_resume(session: Session, update: int, jump: str | None, changed: Mapping[str, tuple[Any, Any]]) -> None:
+def _announce_resume(session: Session, update: int, jump: str | None, changes: Mapping[str, tuple[Any, Any]]) -> None:
     """Tells where the run resumes, and what has changed: schedules that jump, and versions."""
     schedule, say = session.schedule, session.display.say
     steps = update * schedule.steps_per_update
     say(f"resuming {session.run_folder.path} at {steps:,} of {schedule.total_steps:,} steps")
     if jump:
         say(f"note: {jump}")
-    for change in changed.items():
+    for change in changes.items():
         say(f"note: {versions.describe_change(*change)}")
 
 

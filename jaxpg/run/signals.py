@@ -32,7 +32,7 @@ class Interrupts:
         self._before = signal.getsignal(signal.SIGINT)
         self._handles = can_be_handled() and self._before is signal.default_int_handler
         if self._handles:
-            signal.signal(signal.SIGINT, self._note)
+            signal.signal(signal.SIGINT, self._handle)
             self._hook, sys.unraisablehook = sys.unraisablehook, self._handle_unraisable
         return self
 
@@ -45,7 +45,7 @@ class Interrupts:
         if self._is_interrupted and kind is not KeyboardInterrupt:
             raise KeyboardInterrupt
 
-    def _note(self, number: int, frame: FrameType | None) -> None:
+    def _handle(self, number: int, frame: FrameType | None) -> None:
         if not self._is_interrupted:
             self._is_interrupted = True
             threading.Thread(target=self._raise_again, daemon=True).start()
@@ -72,14 +72,14 @@ class StopRequests:
     def __enter__(self) -> StopRequests:
         self.signal: signal.Signals | None = None
         numbers = [number for number in self.HANDLED if signal.getsignal(number) is not signal.SIG_IGN]
-        self._before = {number: signal.signal(number, self._note) for number in numbers if can_be_handled()}
+        self._before = {number: signal.signal(number, self._handle) for number in numbers if can_be_handled()}
         return self
 
     def __exit__(self, *exception: object) -> None:
         for number, handler in self._before.items():
             signal.signal(number, handler)
 
-    def _note(self, number: int, frame: FrameType | None) -> None:
+    def _handle(self, number: int, frame: FrameType | None) -> None:
         self.signal = signal.Signals(number)
         if signal.SIGINT in self._before:
             signal.signal(signal.SIGINT, self._before[signal.SIGINT])

@@ -71,7 +71,7 @@ class Display:
         if self._bar:
             self._bar.stop()
 
-    def table(self, rows: dict[str, str]) -> None:
+    def show_table(self, rows: dict[str, str]) -> None:
         """The short table at the end."""
         width = max(map(len, rows)) + 2
         for name, value in rows.items():

@@ -238,8 +238,8 @@ def write_versions(folder: RunFolder) -> None:
 
 def change_versions(folder: RunFolder, recorded: dict[str, Any], now: dict[str, Any]) -> None:
     """Records the versions that continue a run; the previous ones stay in `versions.json` as `earlier`."""
-    before = {name: value for name, value in recorded.items() if name != "earlier"}
-    replace(folder.versions, json.dumps({**now, "earlier": [*recorded.get("earlier", []), before]}, indent=1))
+    previous = {name: value for name, value in recorded.items() if name != "earlier"}
+    replace(folder.versions, json.dumps({**now, "earlier": [*recorded.get("earlier", []), previous]}, indent=1))
 
 
 def read_versions(folder: RunFolder) -> dict[str, Any]:

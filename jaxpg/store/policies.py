@@ -49,7 +49,7 @@ class StoredPolicy(NamedTuple):
     update: int
     has_evaluation: bool = True
 
-    def described(self, which: str) -> str:
+    def describe(self, which: str) -> str:
         """A description of the policy and when it was saved; `which` is "best" or "last"."""
         kind = which if self.has_evaluation else "untrained"
         reason = "" if self.has_evaluation else "no evaluation gave a return; "

@@ -28,8 +28,8 @@ def best_returns(lines: Lines) -> np.ndarray:
 
 def last_returns(config: Config, lines: Lines) -> np.ndarray:
     """The return of the last evaluation by setting and seed, `[settings, num_seeds]`; NaN if there is none."""
-    before = np.full((1, config.num_agents), np.nan)
-    returns = np.concatenate([before, evaluation_returns(lines).reshape(-1, config.num_agents)])
+    empty = np.full((1, config.num_agents), np.nan)
+    returns = np.concatenate([empty, evaluation_returns(lines).reshape(-1, config.num_agents)])
     return returns[-1].reshape(-1, config.run.num_seeds)
 
 

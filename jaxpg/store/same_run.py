@@ -25,8 +25,8 @@ def check_options(run_folder: RunFolder, stored: Config, config: Config) -> None
     """Raises UserError if an option differs that may not change on resume."""
     differences = _find_differences(stored, config)
     if differences:
-        _, has, given = differences[0]
-        raise UserError(f"{given}: {run_folder.path} has {has}, and on resume only {', '.join(RESUMABLE)} may change")
+        _, old, new = differences[0]
+        raise UserError(f"{new}: {run_folder.path} has {old}, and on resume only {', '.join(RESUMABLE)} may change")
 
 
 def check_checkpoint(checkpoints: Checkpoints, number: int, config: Config) -> None:
@@ -47,10 +47,10 @@ def check_checkpoint(checkpoints: Checkpoints, number: int, config: Config) -> N
         made_with = configuration.from_dict(checkpoints.record(number)["meta"]["config"])
     except (TypeError, KeyError, OptionError) as error:
         raise CheckpointError(f"{where}: its options are not those of a run ({error})") from error
-    for name, has, given in _find_differences(made_with, config):
+    for name, old, new in _find_differences(made_with, config):
         if name != "run_dir":  # the folder may have been moved
             advice = "correct it, or remove the checkpoint of another run"
-            raise OtherRunError(f"{where}: made with {has}, but config.yaml has {given}; {advice}")
+            raise OtherRunError(f"{where}: made with {old}, but config.yaml has {new}; {advice}")
 
 
 def _find_differences(before: Config, after: Config) -> list[tuple[str, str, str]]:

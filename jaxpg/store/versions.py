@@ -51,16 +51,16 @@ def find_commit() -> str | None:
 
 def find_changes(recorded: Mapping[str, Any], now: Mapping[str, Any]) -> dict[str, tuple[Any, Any]]:
     """What has changed: name -> (old value, new value)."""
-    known = {name: value for name, value in now.items() if name in recorded or name not in OUR_ENTRIES}
-    return {name: (recorded.get(name), value) for name, value in known.items() if recorded.get(name) != value}
+    current = {name: value for name, value in now.items() if name in recorded or name not in OUR_ENTRIES}
+    return {name: (recorded.get(name), value) for name, value in current.items() if recorded.get(name) != value}
 
 
 def describe_change(name: str, change: tuple[Any, Any]) -> str:
     """A description of a change, and what it means for a resumed run."""
-    was, now = change
+    old, new = change
     meaning = (
         "the bits stay the same if the code computes the same"
         if name in OUR_ENTRIES
         else "the same run, but not the same bits"
     )
-    return f"{name} was {was} and is {now}: {meaning}"
+    return f"{name} was {old} and is {new}: {meaning}"

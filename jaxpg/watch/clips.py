@@ -46,8 +46,8 @@ def make_clip(stored: StoredPolicy, recording: Recording, episode: int, most: in
         last one. None keeps every step.
     """
     length = int(recording.length[episode])
-    every = math.ceil(len(recording.reward) / most) if most else 1
-    steps = frame_steps(length, every)
+    interval = math.ceil(len(recording.reward) / most) if most else 1
+    steps = frame_steps(length, interval)
     step_series = dict(zip(STEPS, (recording.reward, recording.value), strict=True))
     commands = {name: recording.command[..., i] for i, name in enumerate(find_command_names(stored))}
     success = recording.metrics.get("success")
@@ -56,7 +56,7 @@ def make_clip(stored: StoredPolicy, recording: Recording, episode: int, most: in
         look=jax.tree.map(lambda x: x[steps, episode], recording.look),
         series={name: x[steps[:-1], episode] for name, x in (commands | step_series).items()},
         so_far=np.append(0.0, np.cumsum(recording.reward[:length, episode], dtype=np.float64))[steps],
-        dt=every * float(stored.env.dt),
+        dt=interval * float(stored.env.dt),
         episode_return=float(recording.episode_return[episode]),
         success=success_at_end > 0 if np.isfinite(success_at_end) else None,
     )
@@ -74,10 +74,10 @@ def find_limits(stored: StoredPolicy) -> np.ndarray:
     return np.ones(stored.env.action_size) if limits is None else np.asarray(limits, float)
 
 
-def frame_steps(last: int, every: int) -> list[int]:
-    """The steps that are shown: every `every`-th from 0 on, and always the last one.
+def frame_steps(last: int, interval: int) -> list[int]:
+    """The steps that are shown: every `interval`-th from 0 on, and always the last one.
 
     >>> frame_steps(7, 3), frame_steps(6, 3)
     ([0, 3, 6, 7], [0, 3, 6])
     """
-    return [*range(0, last, every), last]
+    return [*range(0, last, interval), last]

@@ -28,7 +28,7 @@ def show_results(session: Session, times: Times | None) -> None:
         return
     if config.sweep:
         display.say(results.make_heading(config))
-        display.table(results.make_table(config, lines))
+        display.show_table(results.make_table(config, lines))
     path, env = str(session.run_folder.path), config.choices["env"]
     rows = {
         "speed": f"{times.rate:,.0f} steps/s",
@@ -36,7 +36,7 @@ def show_results(session: Session, times: Times | None) -> None:
         "run folder": path,
         "evaluate it": f"{registered.command(env, 'evaluate')} run={shlex.quote(path)}",
     }
-    display.table(_summarize_evaluations(lines) | rows)
+    display.show_table(_summarize_evaluations(lines) | rows)
     if config.run.report:
         _write_report(session)
 

@@ -106,7 +106,7 @@ def _has_success(methods: Sequence[Method]) -> bool:
 def write_notes(methods: Sequence[Method]) -> list[str]:
     """Notes on the table: unequal numbers of steps, and too few seeds for an interval."""
     lines, steps = [], common_steps(methods)
-    longer = [f"{method.label} trained until {method.longest:,}" for method in methods if method.longest > steps]
+    longer = [f"{method.label} trained until {method.max_steps:,}" for method in methods if method.max_steps > steps]
     if longer:
         lines.append(f"compared at {steps:,} environment steps, which all have reached; {', '.join(longer)}")
     nearby = [f"{one.method.label} at {one.steps:,}" for one in compute_standings(methods) if one.steps != steps]

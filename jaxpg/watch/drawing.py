@@ -249,11 +249,11 @@ def _project_goal(plane: np.ndarray, goal: np.ndarray) -> np.ndarray | None:
 
 def outline_points(picture: Picture, frames: Frames) -> np.ndarray:
     """The points of all parts, `[F, K, 2]`."""
-    each = [
+    part_points = [
         frames.place[:, i, None] + np.einsum("fij,kj->fki", frames.turn[:, i], part.points)
         for i, part in enumerate(picture.parts)
     ]
-    return np.concatenate(each, axis=1)
+    return np.concatenate(part_points, axis=1)
 
 
 def _center(picture: Picture, frames: Frames) -> Frames:

@@ -31,7 +31,7 @@ class Results(NamedTuple):
     metrics: dict[str, np.ndarray]
 
 
-def play_mjx(stored: StoredPolicy, num_episodes: int, seed: int) -> Results:
+def play_native(stored: StoredPolicy, num_episodes: int, seed: int) -> Results:
     """Episodes in the environment that the policy was trained on; the seed fixes the starts."""
 
     @jax.jit

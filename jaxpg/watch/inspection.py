@@ -62,7 +62,7 @@ def inspect(path: str) -> Inspection:
     update = sound[0] if sound else 0
     schedule = plan(config)
     best_of_checkpoint = best_returns(select_until(lines, update))
-    before = folder.read_versions(run_folder)
+    recorded = folder.read_versions(run_folder)
     return Inspection(
         run_folder=run_folder,
         config=config,
@@ -73,8 +73,8 @@ def inspect(path: str) -> Inspection:
         owner=lock.find_owner(run_folder.path),
         digest=stored.digest(update) if sound else None,
         lines=lines,
-        changed=versions.find_changes(before, versions.collect_versions()),
-        earlier=len(before.get("earlier", [])),
+        changed=versions.find_changes(recorded, versions.collect_versions()),
+        earlier=len(recorded.get("earlier", [])),
     )
 
 
@@ -136,6 +136,6 @@ def _describe_returns(inspection: Inspection) -> dict[str, str]:
 
 
 def _describe_versions(inspection: Inspection) -> str:
-    changes = ", ".join(f"{name} was {was} and is {now}" for name, (was, now) in inspection.changed.items())
+    changes = ", ".join(f"{name} was {old} and is {new}" for name, (old, new) in inspection.changed.items())
     earlier = f"; {inspection.earlier} others before (versions.json)" if inspection.earlier else ""
     return (changes or "unchanged") + earlier

@@ -55,12 +55,12 @@ class Method(NamedTuple):
         return np.array(steps), np.array([[values[step] for step in steps] for values in curves])
 
     @property
-    def reached(self) -> int:
+    def max_common_steps(self) -> int:
         """The largest number of steps at which all agents have been evaluated."""
         return int(self.values("eval_return")[0][-1])
 
     @property
-    def longest(self) -> int:
+    def max_steps(self) -> int:
         """The largest number of steps at which any agent has been evaluated."""
         return max(max(agent.curves["eval_return"]) for agent in self.agents)
 
@@ -119,7 +119,7 @@ def _check_one_task(runs: Sequence[tuple[str, str]]) -> None:
 
 def common_steps(methods: Sequence[Method]) -> int:
     """The largest number of environment steps that all methods have reached."""
-    return min(method.reached for method in methods)
+    return min(method.max_common_steps for method in methods)
 
 
 def compute_standings(methods: Sequence[Method]) -> list[Standing]:

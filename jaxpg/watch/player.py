@@ -163,11 +163,11 @@ def _make_workspace(scene: Scene, recordings: Sequence[Recording]) -> Json:
 
 def _list_goals(recording: Recording, plane: np.ndarray) -> np.ndarray:
     """A row for each episode with a finite goal: two coordinates, final distance, and success; `[K, 4]`."""
-    last, every = recording.length - 1, np.arange(len(recording.length))
+    last, episodes = recording.length - 1, np.arange(len(recording.length))
     goals = recording.look.goal[0] @ plane.T
-    success = np.nan_to_num(recording.metrics["success"][last, every].astype(float))
+    success = np.nan_to_num(recording.metrics["success"][last, episodes].astype(float))
     distance = recording.metrics.get("distance")
-    distance = np.full(len(every), np.nan) if distance is None else distance[last, every]
+    distance = np.full(len(episodes), np.nan) if distance is None else distance[last, episodes]
     return np.column_stack([goals, distance, success])[np.isfinite(goals).all(axis=1)]
 
 

@@ -79,8 +79,8 @@ def build_report(run_folder: RunFolder, config: Config, stages: Stages) -> Json:
     lines, notes, stored = folder.read_metrics(run_folder, config.num_agents), [], next(iter(stages.values()))
 
     def try_part(what: str, draw: Callable[[], Any], otherwise: Any = None) -> Any:
-        drawn = attempt(what, draw, notes.append)
-        return otherwise if drawn is None else drawn
+        result = attempt(what, draw, notes.append)
+        return otherwise if result is None else result
 
     view = find_view(stored.env, notes.append)
     starts = _make_starts(config)
@@ -147,10 +147,10 @@ def _make_policy_table(
 
 def _measure(label: str, stage: StoredPolicy, recording: Recording) -> dict[str, str]:
     """A row of the table, by column."""
-    every, limits = np.arange(len(recording.length)), find_limits(stage)
+    episodes, limits = np.arange(len(recording.length)), find_limits(stage)
     row = {"policy": label, "return": _format_return(recording)}
     if "success" in recording.metrics:
-        row["success"] = _format_percent(recording.metrics["success"][recording.length - 1, every])
+        row["success"] = _format_percent(recording.metrics["success"][recording.length - 1, episodes])
     row["chatter"] = _format_percent(chatter(recording.command, limits, recording.length))
     row["at a limit"] = _format_percent(share_at_limit(recording.command, limits, recording.length))
     row["updates"] = f"{stage.update:,}"

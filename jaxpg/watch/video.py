@@ -51,11 +51,11 @@ def render(options: RenderOptions, changes: Mapping[str, Any], say: Callable[[st
         stored = _load_policy(options, changes)
     with compilation_cache(options.cache, say):
         clips = play_clips(stored, options.episodes, options.seed)
-    every, seconds = choose_pace(clips[0].dt, options.speed, min(options.fps, format_.fastest))
-    movie.write(out, draw_images(stored, clips, every, (options.width, options.height), backend), seconds)
-    number = len(shown_steps(clips, every))
+    interval, seconds = choose_pace(clips[0].dt, options.speed, min(options.fps, format_.fastest))
+    movie.write(out, draw_images(stored, clips, interval, (options.width, options.height), backend), seconds)
+    number = len(shown_steps(clips, interval))
     returns = " ".join(f"{one.episode_return:.1f}" for one in clips)
-    say(f"{described(stored.config)}, {stored.described(options.checkpoint)}")
+    say(f"{described(stored.config)}, {stored.describe(options.checkpoint)}")
     say(f"returns  {returns}")
     say(f"{out}  {number} pictures, {float(number * seconds):.2f} s at {float(1 / seconds):.4g} a second")
 
@@ -110,24 +110,24 @@ def choose_pace(dt: float, speed: float, most: int) -> tuple[int, Fraction]:
     >>> choose_pace(0.05, 1.0, 60), choose_pace(0.005, 1.0, 60)
     ((1, Fraction(1, 20)), (4, Fraction(1, 50)))
     """
-    every = max(1, math.ceil(speed / (dt * most) - ROUNDING))
-    return every, 1 / Fraction(speed / (dt * every)).limit_denominator(MAX_DENOMINATOR)
+    interval = max(1, math.ceil(speed / (dt * most) - ROUNDING))
+    return interval, 1 / Fraction(speed / (dt * interval)).limit_denominator(MAX_DENOMINATOR)
 
 
-def shown_steps(clips: Sequence[Clip], every: int) -> list[int]:
+def shown_steps(clips: Sequence[Clip], interval: int) -> list[int]:
     """The steps that are shown, up to and including the last one of the longest episode."""
-    return frame_steps(max(len(one.look.qpos) for one in clips) - 1, every)
+    return frame_steps(max(len(one.look.qpos) for one in clips) - 1, interval)
 
 
 def draw_images(
-    stored: StoredPolicy, clips: Sequence[Clip], every: int, size: tuple[int, int], backend: str
+    stored: StoredPolicy, clips: Sequence[Clip], interval: int, size: tuple[int, int], backend: str
 ) -> Iterator[np.ndarray]:
     """The images of the video, `[H, W, 3]`.
 
     Args:
       stored: the policy that plays.
       clips: episodes with every step.
-      every: number of steps from one picture to the next.
+      interval: number of steps from one picture to the next.
       size: width and height of one episode's picture.
       backend: from `gl.find_backend`.
     """
@@ -135,7 +135,7 @@ def draw_images(
 
     scene = find_view(stored.env).scene
     with Canvas(scene.model, backend, choose_grid(len(clips)), size, scene.goal_radius) as canvas:
-        for step in shown_steps(clips, every):
+        for step in shown_steps(clips, interval):
             yield canvas.draw([make_cell(stored, scene, one, step) for one in clips])
 
 
@@ -144,15 +144,15 @@ def make_cell(stored: StoredPolicy, scene: Scene, one: Clip, step: int) -> Any:
     from jaxpg.watch.canvas import Cell
 
     last, names = len(one.look.qpos) - 1, find_command_names(stored)
-    now = min(step, last)
-    commands = np.array([one.series[name][now] if now < last else 0.0 for name in names])
+    current = min(step, last)
+    commands = np.array([one.series[name][current] if current < last else 0.0 for name in names])
     efforts = commands / find_limits(stored) if len(names) == scene.model.nu else np.zeros(scene.model.nu)
-    goal = None if one.look.goal is None else one.look.goal[now]
-    return Cell(one.look.qpos[now], goal, efforts, _make_caption(one, now, last))
+    goal = None if one.look.goal is None else one.look.goal[current]
+    return Cell(one.look.qpos[current], goal, efforts, _make_caption(one, current, last))
 
 
-def _make_caption(one: Clip, now: int, last: int) -> str:
-    text = f"{now * one.dt:.2f} s  return {one.so_far[now]:.1f}"
-    if now == last and one.success is not None:
+def _make_caption(one: Clip, current: int, last: int) -> str:
+    text = f"{current * one.dt:.2f} s  return {one.so_far[current]:.1f}"
+    if current == last and one.success is not None:
         text += "  success" if one.success else "  missed"
     return text

@@ -95,8 +95,8 @@ def _create(client: Any, name: str, config: Mapping[str, Any]) -> str:
     from mlflow.entities import Param
 
     experiment = os.environ.get("MLFLOW_EXPERIMENT_NAME", "jaxpg")
-    known = client.get_experiment_by_name(experiment)
-    experiment_id = known.experiment_id if known else client.create_experiment(experiment)
+    existing = client.get_experiment_by_name(experiment)
+    experiment_id = existing.experiment_id if existing else client.create_experiment(experiment)
     run_id = client.create_run(experiment_id, run_name=name).info.run_id
     params = [Param(key, str(value)) for key, value in _flatten(config)]
     for first in range(0, len(params), MAX_PARAMS):
