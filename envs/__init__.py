@@ -2,8 +2,8 @@
 
     env = envs.make("pendulum", mass=2.0)
 
-A registry entry keeps what belongs to an environment together: its options, how it is built, and the training values
-that were tuned on it. Importing this package loads neither mujoco nor brax; making an environment does.
+A registry entry holds everything about an environment: its options, how to build it, and the training values tuned on
+it. Importing this package loads neither mujoco nor brax; making an environment does.
 """
 
 from __future__ import annotations
@@ -16,19 +16,19 @@ from typing import Any, NamedTuple
 
 from envs import arm, brax_env, pendulum, playground_env, quadratic
 from envs.contract import conform
-from envs.options import OptionError, build, declaration_problems, unknown
-from envs.user_code import user_code
+from envs.options import OptionError, build, describe_unknown, find_declaration_problems
+from envs.user_code import catch_user_errors
 
 
 class Entry(NamedTuple):
     """One environment of the registry.
 
     Attributes:
-      config: dataclass of its options; has `episode_length`.
+      config: dataclass of its options, with `episode_length`.
       build: `build(config) -> env`.
       training: tuned training values by algorithm, under the training command's option names; the first algorithm is
-        the environment's default. `network` among the values chooses the network, and options of another network than
-        the chosen one do not count. An algorithm that is not there trains with the training command's defaults.
+        the environment's default. `network` among the values chooses the network, and options of other networks are
+        ignored. Other algorithms train with the training command's defaults.
     """
 
     config: type
@@ -36,7 +36,7 @@ class Entry(NamedTuple):
     training: Mapping[str, Mapping[str, Any]] = MappingProxyType({})
 
 
-RESERVED = "id"  # under which a run's config.yaml names the environment, beside its options
+RESERVED = "id"  # in a run's config.yaml, the name of the environment among its options
 REGISTRY: dict[str, Entry] = {
     "pendulum": Entry(pendulum.PendulumConfig, pendulum.Pendulum, pendulum.TRAINING),
     "arm": Entry(arm.ArmConfig, arm.Arm, arm.TRAINING),
@@ -48,15 +48,15 @@ SHIPPED = tuple(REGISTRY)
 
 
 def register(name: str, entry: Entry) -> None:
-    """Adds an environment of one's own: it can be made, trained and looked at as the others, by its name.
+    """Adds your own environment: it can be made, trained and rendered by its name, like the others.
 
-    What is wrong with its options or its training values is said when it is asked for.
+    Mistakes in its options or training values are reported when it is used.
 
     Raises:
-      ValueError: there is one of that name already, or the name is not a text with something in it.
+      ValueError: the name is taken, or is not a non-empty line of text.
     """
     if not (isinstance(name, str) and name.strip() and name.isprintable()):
-        raise ValueError(f"an environment cannot be called {name!r}: expected a text of one line")
+        raise ValueError(f"an environment cannot be called {name!r}: expected one line of text")
     if name in REGISTRY:
         raise ValueError(f"there is an environment called '{name}' already")
     REGISTRY[name] = entry
@@ -70,24 +70,24 @@ def make(name: str, /, **overrides: Any) -> Any:
       **overrides: options by name, see the environment's config class.
 
     Raises:
-      OptionError: no such environment or option (with the nearest name), wrong type, or value out of range; or the
-        environment does not give what it must (`envs.contract`).
+      OptionError: there is no such environment or option (with the nearest name), a type is wrong, a value is out of
+        range, or the environment violates its contract (`envs.contract`).
 
     >>> make("pendulum", length=0.5).observation_size
     3
     """
-    return of_config(name, build(find(name).config, overrides))
+    return make_from_config(name, build(find(name).config, overrides))
 
 
-def of_config(name: str, config: Any) -> Any:
+def make_from_config(name: str, config: Any) -> Any:
     """The environment called `name` with these options; raises OptionError as `make` does.
 
-    One of somebody's own is looked at before it is handed out. brax's and Playground's are known, and slow to trace.
+    A user's environment is checked first. Those of brax and Playground are not, as they are slow to trace.
     """
     entry = find(name)
     if name in SHIPPED:
         return entry.build(config)
-    with user_code(name, "its build", entry.build):
+    with catch_user_errors(name, "its build", entry.build):
         env = entry.build(config)
     return conform(env, name)
 
@@ -96,19 +96,19 @@ def find(name: str) -> Entry:
     """The registry entry called `name`.
 
     Raises:
-      OptionError: there is none, with the nearest name; or its options are none that can be given.
+      OptionError: there is none (with the nearest name), or its options are not valid.
     """
     if name not in REGISTRY:
-        raise OptionError([unknown("environment", name, REGISTRY)])
+        raise OptionError([describe_unknown("environment", name, REGISTRY)])
     entry = REGISTRY[name]
-    problems = [f"env={name}: {problem}" for problem in _problems_of_options(entry.config)]
+    problems = [f"env={name}: {problem}" for problem in _find_option_problems(entry.config)]
     if problems:
         raise OptionError(problems)
     return entry
 
 
-def _problems_of_options(config: Any) -> Iterator[str]:
-    problems = list(declaration_problems(config))
+def _find_option_problems(config: Any) -> Iterator[str]:
+    problems = list(find_declaration_problems(config))
     yield from problems
     if problems:
         return

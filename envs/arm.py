@@ -1,14 +1,14 @@
 """Reach a goal with a planar two-link arm.
 
 Each episode draws a goal x_goal uniformly over a ring around the shoulder. With the end effector x_ee(q), the joint
-torques tau_t and d_t = |x_ee(q_t) - x_goal| the reward is, of the state and action before the step,
+torques tau_t and d_t = |x_ee(q_t) - x_goal|, the reward of the state and action before the step is
 
     lesson:   r_t = -lambda_pos d_t^2                        - lambda_torque |tau_t|^2     (the lesson's section 5.2)
     precise:  r_t = -lambda_pos (d_t^2 + PULL d_t)           - lambda_torque |tau_t|^2
 
-The square is flat near the goal (at 2 cm its slope is 0.04 per metre); the added distance, which is the default, pulls
-with the same slope at every distance, up to the last centimetre. Never terminates; the time limit is a truncation.
-`success` is reported at every step; the last step's is the episode's.
+The square is flat near the goal (at 2 cm its slope is 0.04 per metre). The distance added by `precise`, the default,
+has the same slope everywhere, down to the last centimetre. Never terminates; the time limit is a truncation. `success`
+is reported at every step; that of the last step counts for the episode.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from envs.options import OptionError, option
 from envs.physics import PHYSICS, load_spec
 from envs.scenes import Scene
 
-PULL = 1.0  # weight [m] of the distance beside its square in the precise reward
+PULL = 1.0  # weight of the distance relative to its square in the precise reward [m]
 STANDARD_GRAVITY = 9.81  # [m/s^2]
 
 
@@ -33,7 +33,7 @@ class ArmConfig:
     """Options of the arm."""
 
     reward: str = option(
-        "precise", "squared distance, or one that pulls at the last centimetres too", choices=("lesson", "precise")
+        "precise", "squared distance, or one that also pulls over the last centimetres", choices=("lesson", "precise")
     )
     control: str = option("torque", "what an action commands", choices=("torque", "velocity"))
     gravity: bool = option(False, "the arm moves in the upright plane, under gravity")
@@ -52,7 +52,7 @@ class ArmConfig:
     success_radius: float = option(0.05, "distance that counts as reached [m]", above=0)
     dt: float = option(0.05, "time between two actions [s]", above=0, at_most=1)
     num_substeps: int = option(5, "physics steps between two actions", at_least=1)
-    physics: str = option("scalar", "MJX's step as scalar equations or as it is, or C MuJoCo's", choices=tuple(PHYSICS))
+    physics: str = option("scalar", "MJX's step as scalar equations, MJX itself, or C MuJoCo", choices=tuple(PHYSICS))
     episode_length: int = option(100, "steps until the time limit", at_least=1)
 
     def __post_init__(self):
@@ -82,7 +82,7 @@ TRAINING = {
         "algo.gamma": 0.9,
         "algo.lambda_": 0.85,
         "algo.reward_scale": 10.0,
-        "algo.normalize_advantages": False,  # they fall with the distance, and so do the steps
+        "algo.normalize_advantages": False,  # they shrink with the distance, and so do the steps
         "network.widths": [32, 32],
         "network.activation": "elu",
     },
@@ -122,7 +122,7 @@ class Arm(MjxEnv):
     def __init__(self, config: ArmConfig = ArmConfig()):
         self.config = config
         self.lengths = (config.upper_length, config.fore_length)
-        super().__init__(_spec(config), config.num_substeps, config.physics, check=False)
+        super().__init__(_make_spec(config), config.num_substeps, config.physics, check=False)
 
     @property
     def interface(self) -> Interface:
@@ -166,7 +166,7 @@ class Arm(MjxEnv):
         )
 
     def _command(self, state: ArmState, action: jax.Array) -> tuple[jax.Array, jax.Array]:
-        """The actuators' control, and the torque that it asks for at this state."""
+        """The actuators' control, and the torque that it requests in this state."""
         config = self.config
         if config.control == "torque":
             torque = config.torque_limit * action
@@ -216,7 +216,7 @@ def sample_ring(key: jax.Array, inner: float, outer: float) -> jax.Array:
     return radius * jnp.stack([jnp.cos(angle), jnp.sin(angle)])
 
 
-def _spec(config: ArmConfig):
+def _make_spec(config: ArmConfig):
     """The MJCF with the options written into it: lengths, inertias, gravity, actuators."""
     spec = load_spec(ASSETS / "arm.xml")
     spec.option.timestep = config.dt / config.num_substeps

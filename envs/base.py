@@ -1,12 +1,12 @@
-"""The environment interface, brax's, and the base of environments that are a MuJoCo model.
+"""The environment interface, which is brax's, and a base class for environments with a MuJoCo model.
 
 An environment is two pure functions of one (unbatched) episode, as in `brax.envs.base.Env`:
 
     reset(key) -> State                 s_0 ~ rho_0
     step(state, action) -> State        s_{t+1}, r_t, done;  action in [-1, 1]^m
 
-`State` has the fields of brax's, so brax's wrappers and trainers take these environments; brax itself, slow to import,
-is not needed for them. Time limits are not the environment's business: `done` is termination only.
+`State` has the fields of brax's, so brax's wrappers and trainers accept these environments, without importing brax,
+which is slow. Environments have no time limit: `done` means termination only.
 """
 
 from __future__ import annotations
@@ -31,12 +31,12 @@ class State:
     """One environment after a reset or a step: the fields of `brax.envs.base.State`.
 
     Attributes:
-      pipeline_state: what the next step needs of the physics, and no more (not all of `mjx.Data`).
+      pipeline_state: only what the next step needs of the physics (not all of `mjx.Data`).
       obs: observation, `[observation_size]`.
       reward: r_t of the step that led here, scalar; 0 after a reset.
       done: 1.0 if that step ended in a terminal state, else 0.0.
-      metrics: scalars to look at, by name.
-      info: empty here; brax's wrappers keep their own values in it.
+      metrics: scalars to log, by name.
+      info: empty here; brax's wrappers store their values in it.
     """
 
     pipeline_state: Any
@@ -48,13 +48,13 @@ class State:
 
 
 class Interface(NamedTuple):
-    """What an environment's numbers are to a robot; optional, as the attribute `interface`.
+    """The meaning of an environment's numbers for a robot; optional, as the attribute `interface`.
 
     Attributes:
-      observations: name and unit of each number that is observed.
-      commands: name and unit of each number that an action commands.
-      limits: the command at action 1, for each; what is commanded is limit * clip(action, -1, 1). None: the action is
-        the command, and has no limits.
+      observations: name and unit of each observed number.
+      commands: name and unit of each commanded number.
+      limits: the commands at action 1; a command is limit * clip(action, -1, 1). None: the action itself is the
+        command, without limits.
     """
 
     observations: tuple[str, ...]
@@ -63,9 +63,9 @@ class Interface(NamedTuple):
 
 
 def interface(env: Any) -> Interface:
-    """The environment's own, in plain names and numbers; names alone where it has none, as brax's have not.
+    """The environment's interface in plain strings and floats; for environments without one, generic names.
 
-    An environment may say its names and limits as any sequences, such as NumPy's or JAX's arrays.
+    An environment may give its names and limits as any sequences, such as arrays of NumPy or JAX.
     """
     if hasattr(env, "interface"):
         observations, commands, limits = env.interface
@@ -79,15 +79,15 @@ def interface(env: Any) -> Interface:
 
 
 class MjxEnv:
-    """What environments over one MuJoCo model share; a subclass adds `reset` and `step`.
+    """Base class of environments with one MuJoCo model; a subclass adds `reset` and `step`.
 
     Args:
-      spec: the MuJoCo specification, already edited to the environment's options.
+      spec: the MuJoCo specification, with the environment's options applied.
       num_substeps: physics steps between two actions.
-      physics: how they are computed: "scalar" (equations made of MJX's step), "mjx" (that step itself) or "mujoco" (C
-        MuJoCo's step, of which there is nothing to check).
-      check: log what MJX does otherwise than C MuJoCo (`envs.physics.check_model`), which takes a second or more. The
-        shipped environments leave it to the tests.
+      physics: how they are computed: "scalar" (scalar equations of MJX's step), "mjx" (that step itself) or "mujoco" (C
+        MuJoCo's step, which is never checked).
+      check: log differences between MJX and C MuJoCo (`envs.physics.check_model`), which takes a second or more. The
+        shipped environments leave this to the tests.
     """
 
     def __init__(self, spec: Any, num_substeps: int = 1, physics: str = "scalar", check: bool = True):
@@ -115,16 +115,16 @@ class MjxEnv:
 
     @property
     def scene(self) -> Scene:
-        """How a state looks; a subclass whose state has no `qpos`, or that has a goal, says so."""
+        """How a state looks; override it if the state has no `qpos` or the environment has a goal."""
         return Scene(self.model, lambda state: state.pipeline_state.qpos)
 
 
 def with_fields(state: Any, **values: Any) -> Any:
-    """The State with other values in some of its fields; it is a named tuple or a dataclass, whosever."""
+    """The State with some fields replaced; it may be any named tuple or dataclass."""
     return state._replace(**values) if hasattr(state, "_replace") else dataclasses.replace(state, **values)
 
 
 def initial_state(pipeline_state: Any, obs: jax.Array, metric_names: tuple[str, ...] = ()) -> State:
-    """The State after a reset: nothing earned, nothing ended, all metrics 0."""
-    zero = jnp.zeros((), getattr(obs, "dtype", float))  # what is no array is refused by its own name, not here
+    """The State after a reset: reward, `done` and all metrics are 0."""
+    zero = jnp.zeros((), getattr(obs, "dtype", float))  # if obs is not an array, envs.contract reports it
     return State(pipeline_state, obs, reward=zero, done=zero, metrics=dict.fromkeys(metric_names, zero))

@@ -1,7 +1,7 @@
-"""brax's own environments, by their names: `make("brax", name="inverted_pendulum")`.
+"""brax's own environments, by name: `make("brax", name="inverted_pendulum")`.
 
-They are handed on as they are: brax's State is what this project's environments return too. They carry all of brax's
-pipeline state, and are as fast as brax is on a CPU.
+They are used unchanged, as this project's environments return brax's State too. They carry all of brax's pipeline
+state, and are as fast as brax is on a CPU.
 """
 
 from __future__ import annotations
@@ -12,14 +12,14 @@ import warnings
 from dataclasses import dataclass
 from typing import Any
 
-from envs.options import OptionError, option, unknown
+from envs.options import OptionError, describe_unknown, option
 
-# Steps are slow: a checkpoint is due after fewer of them.
+# Steps are slow, so checkpoints come after fewer of them.
 _SLOW = {"total_steps": 2_000_000, "eval_episodes": 16, "checkpoint_interval": 500_000}
 TRAINING = {
     "td": {**_SLOW, "num_envs": 64},
     "reinforce": {**_SLOW, "num_envs": 16},
-    "ppo": {  # of a handful tried on the reacher
+    "ppo": {  # the best of a handful of settings on the reacher
         **_SLOW,
         "num_envs": 128,
         "num_steps": 32,
@@ -45,11 +45,11 @@ def make(config: BraxConfig) -> Any:
     """The brax environment.
 
     Raises:
-      OptionError: brax has none of that name (with the nearest one), or one that does not run.
+      OptionError: brax has no such environment (with the nearest name), or it does not run.
     """
-    if config.name == "swimmer":  # brax.fluid gives jax.numpy.clip an argument that it has no more
+    if config.name == "swimmer":  # brax.fluid passes jax.numpy.clip an argument that no longer exists
         raise OptionError(["env.name=swimmer: brax's does not run with jax 0.10 or newer"])
-    # brax says at every import that it is no longer maintained, and MJX that it has no Warp: neither helps here.
+    # At every import brax says that it is no longer maintained, and MJX that Warp is missing: neither helps here.
     with warnings.catch_warnings(), contextlib.redirect_stdout(io.StringIO()):
         warnings.simplefilter("ignore")
         from brax import envs
@@ -60,4 +60,4 @@ def make(config: BraxConfig) -> Any:
             pass
     known = ("ant", "fast", "halfcheetah", "hopper", "humanoid", "humanoidstandup", "inverted_pendulum")
     known += ("inverted_double_pendulum", "pusher", "reacher", "walker2d")
-    raise OptionError([unknown("brax environment", config.name, known)])
+    raise OptionError([describe_unknown("brax environment", config.name, known)])

@@ -1,4 +1,4 @@
-"""Commands in messages, as who reads them can type them."""
+"""Commands for messages, as the user can type them."""
 
 from __future__ import annotations
 
@@ -8,10 +8,10 @@ import sys
 from pathlib import Path
 
 
-def python() -> str:
-    """The interpreter that runs this: by its name if the shell finds it by that, else by its path.
+def python_command() -> str:
+    """The running interpreter: its name if the shell finds it by that, else its path.
 
-    The path is relative where the interpreter is below the working directory: `.venv/bin/python`.
+    The path is relative if the interpreter is below the working directory: `.venv/bin/python`.
     """
     path = Path(sys.executable or "python")
     if shutil.which(path.name) == str(path):
@@ -22,5 +22,5 @@ def python() -> str:
 
 
 def pip_install(*packages: str) -> str:
-    """The command that installs packages for this interpreter, and for no other that is on the machine."""
-    return f"{python()} -m pip install {shlex.join(packages)}"
+    """The command that installs packages for exactly this interpreter."""
+    return f"{python_command()} -m pip install {shlex.join(packages)}"

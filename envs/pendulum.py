@@ -34,7 +34,7 @@ class PendulumConfig:
     torque_limit: float = option(2.0, "largest torque, reached at |action| = 1 [N m]", above=0)
     speed_limit: float = option(8.0, "angular speed is clipped to this [rad/s]", above=0)
     dt: float = option(0.05, "time between two actions, one physics step [s]", above=0, at_most=1)
-    physics: str = option("scalar", "MJX's step as scalar equations or as it is, or C MuJoCo's", choices=tuple(PHYSICS))
+    physics: str = option("scalar", "MJX's step as scalar equations, MJX itself, or C MuJoCo", choices=tuple(PHYSICS))
     episode_length: int = option(200, "steps until the time limit", at_least=1)
 
 
@@ -53,13 +53,13 @@ TRAINING = {
         "algo.gamma": 0.995,
         "algo.lambda_": 0.9,
         "algo.reward_scale": 0.2,
-        "algo.episode_length": 100,  # a swing-up, and not much of the balancing that the rest of the 200 steps are
-        # With its squares the energy is linear in the observation: whether a swing will do is a question of the energy.
+        "algo.episode_length": 100,  # covers the swing-up and little of the balancing after it
+        # With the squares, the energy is linear in the observation, and the energy decides whether a swing suffices.
         "network.features": "polynomial",
         "network.order": 2,
         "network.widths": [32, 32],
         "network.sigma": 1.3,
-        "network.squash": False,  # the best torque is the limit itself most of the time, where tanh never gets
+        "network.squash": False,  # the best torque is mostly the limit itself, which tanh never reaches
     },
     "td": {
         "num_envs": 32,
@@ -71,7 +71,7 @@ TRAINING = {
         "algo.reward_scale": 0.02,
         "network.activation": "relu",
         "network.sigma": 1.0,
-        "network.sigma_is": "fixed",  # where it is learned, single seeds are never solved
+        "network.sigma_is": "fixed",  # if it is learned, some seeds are never solved
     },
     "reinforce": {
         "num_envs": 16,
@@ -116,7 +116,7 @@ class Pendulum(MjxEnv):
 
     def __init__(self, config: PendulumConfig = PendulumConfig()):
         self.config = config
-        super().__init__(_spec(config), physics=config.physics, check=False)
+        super().__init__(_make_spec(config), physics=config.physics, check=False)
 
     @property
     def interface(self) -> Interface:
@@ -124,9 +124,9 @@ class Pendulum(MjxEnv):
 
     @property
     def references(self) -> dict[str, float]:
-        """What the best possible policy earns on average; known of Gymnasium's constants alone."""
-        gymnasiums = dataclasses.replace(self.config, physics="scalar") == PendulumConfig()
-        return {"best possible": BEST_RETURN} if gymnasiums else {}
+        """The mean return of the best possible policy, known only for Gymnasium's constants."""
+        is_gymnasium = dataclasses.replace(self.config, physics="scalar") == PendulumConfig()
+        return {"best possible": BEST_RETURN} if is_gymnasium else {}
 
     @property
     def phase_plane(self) -> PhasePlane:
@@ -172,8 +172,8 @@ def reward(theta: jax.Array, theta_dot: jax.Array, torque: jax.Array) -> jax.Arr
     return -(wrapped**2 + 0.1 * theta_dot**2 + 0.001 * torque**2)
 
 
-def _spec(config: PendulumConfig):
-    """The MJCF with the options written into it: inertia follows mass and length, pictures follow length."""
+def _make_spec(config: PendulumConfig):
+    """The MJCF with the options applied: the inertia follows mass and length, the geometry the length."""
     spec = load_spec(ASSETS / "pendulum.xml")
     spec.option.timestep = config.dt
     spec.option.gravity = [0.0, 0.0, -config.gravity]

@@ -1,7 +1,7 @@
-"""MuJoCo Playground's environments, by their names: `make("playground", name="CartpoleBalance")`.
+"""MuJoCo Playground's environments, by name: `make("playground", name="CartpoleBalance")`.
 
-They are stepped by `mjx.step` in JAX, as Playground has them, and are as fast as that is on a CPU. Where Playground
-observes several things by name, such as what only a critic may see, it is the entry "state" that is observed here.
+As in Playground, they are stepped by `mjx.step` in JAX, and are as fast as that is on a CPU. If Playground has several
+observations by name, such as one for the critic only, the entry "state" is used.
 """
 
 from __future__ import annotations
@@ -19,13 +19,13 @@ import jax
 
 from envs.base import State
 from envs.hints import pip_install
-from envs.options import OptionError, option, unknown
+from envs.options import OptionError, describe_unknown, option
 from envs.scenes import Scene
 
-# Steps are slow: a checkpoint is due after fewer of them.
+# Steps are slow, so checkpoints come after fewer of them.
 _SLOW = {"total_steps": 2_000_000, "eval_episodes": 16, "checkpoint_interval": 500_000}
 TRAINING = {
-    "ppo": {  # of a handful tried on CartpoleBalance, where TD(lambda) with its defaults learns little
+    "ppo": {  # the best of a handful of settings on CartpoleBalance, where TD(lambda) with its defaults learns little
         **_SLOW,
         "num_envs": 128,
         "num_steps": 32,
@@ -49,10 +49,10 @@ class PlaygroundConfig:
 
 
 class Playground:
-    """An environment of Playground's interface with brax's: `State.data` is carried within `State.pipeline_state`.
+    """A Playground environment with brax's interface; Playground's State is in `State.pipeline_state`.
 
     Args:
-      env: with Playground's `reset(key) -> State` and `step(State, action) -> State`.
+      env: has Playground's `reset(key) -> State` and `step(State, action) -> State`.
     """
 
     def __init__(self, env: Any):
@@ -79,16 +79,16 @@ class Playground:
         return Scene(self.env.mj_model, lambda state: state.pipeline_state.data.qpos)
 
     def reset(self, rng: jax.Array) -> State:
-        """Playground's own start; it is given the key as two plain numbers, since it keeps keys in its states."""
-        return adapted(self.env.reset(jax.random.key_data(rng)))
+        """Playground's reset; it gets the key as two numbers, since it stores keys in its states."""
+        return adapt_state(self.env.reset(jax.random.key_data(rng)))
 
     def step(self, state: State, action: jax.Array) -> State:
-        """Playground's own step."""
-        return adapted(self.env.step(state.pipeline_state, action))
+        """Playground's step."""
+        return adapt_state(self.env.step(state.pipeline_state, action))
 
 
-def adapted(state: Any) -> State:
-    """Playground's state, whole, within brax's, with an array as observation."""
+def adapt_state(state: Any) -> State:
+    """Playground's whole state within brax's, with an array as observation."""
     obs = state.obs["state"] if isinstance(state.obs, Mapping) else state.obs
     return State(state, obs, state.reward, state.done, state.metrics)
 
@@ -97,23 +97,23 @@ def make(config: PlaygroundConfig) -> Playground:
     """The environment of that name.
 
     Raises:
-      OptionError: Playground is not installed, or has none of that name (with the nearest one), or cannot make it: its
-        robots are MuJoCo Menagerie's, which it downloads when the first is asked for, and a few of its environments are
-        behind the present MuJoCo.
+      OptionError: Playground is not installed, has no such environment (with the nearest name), or cannot make it. Its
+        robots are from MuJoCo Menagerie, which it downloads at first use, and a few of its environments do not work
+        with the current MuJoCo.
     """
     if importlib.util.find_spec("mujoco_playground") is None:
         raise OptionError([f"env=playground needs MuJoCo Playground: {pip_install('playground')}"])
-    # What its dependencies say as they are imported helps nobody here.
+    # Hides messages of its dependencies while they are imported.
     with warnings.catch_warnings(), contextlib.redirect_stdout(io.StringIO()):
         warnings.simplefilter("ignore")
         from mujoco_playground import registry
 
         if config.name not in registry.ALL_ENVS:
-            raise OptionError([unknown("Playground environment", config.name, registry.ALL_ENVS)])
+            raise OptionError([describe_unknown("Playground environment", config.name, registry.ALL_ENVS)])
         try:
             return Playground(registry.load(config.name, config_overrides={"impl": "jax"}))
         except (OSError, subprocess.SubprocessError) as error:
-            reason = f"its robot is of MuJoCo Menagerie, which Playground could not download ({error})"
+            reason = f"its robot is from MuJoCo Menagerie, which Playground could not download ({error})"
         except AttributeError as error:
-            reason = f"Playground and this release of MuJoCo do not go together ({error})"
+            reason = f"Playground does not work with this release of MuJoCo ({error})"
     raise OptionError([f"env.name={config.name}: {reason}"])

@@ -1,8 +1,8 @@
-"""How the states of an environment look: for videos and reports, never for training.
+"""How the states of an environment look: for videos and reports, not for training.
 
-An environment that can be looked at has a `scene`; brax's own have a MuJoCo model too. One whose state is a point of a
-plane may have a `phase_plane`, over which a value function is drawn as a map. One that knows what a return is worth may
-have `references`: returns by what they are, such as `{"best possible": -137.4}`.
+All three attributes are optional. `scene` shows the robot; brax's own environments have a MuJoCo model instead. An
+environment whose state is a point in a plane may have a `phase_plane`, over which the value function is drawn as a map.
+`references` are returns to compare with, by label, such as `{"best possible": -137.4}`.
 """
 
 from __future__ import annotations
@@ -14,13 +14,13 @@ import jax
 
 
 class Scene(NamedTuple):
-    """A MuJoCo model, and how it stands in a state.
+    """A MuJoCo model, and its pose in a state.
 
     Attributes:
       model: `mujoco.MjModel`.
       qpos: `qpos(State) -> [nq]`, the joint positions.
-      goal: `goal(State) -> [3]`, where the robot should get [m]; None where there is no such place.
-      goal_radius: how near is near enough [m]; None without a goal.
+      goal: `goal(State) -> [3]`, the place that the robot should reach [m]; None if there is none.
+      goal_radius: distance that counts as reached [m]; None without a goal.
     """
 
     model: Any
@@ -30,13 +30,13 @@ class Scene(NamedTuple):
 
 
 class PhasePlane(NamedTuple):
-    """Two coordinates x, y that say all of a state.
+    """Two coordinates x, y that determine a state.
 
     Attributes:
       labels: their names and units.
       ranges: lower and upper end of each.
-      wraps: whether the ends of the range are the same state, of each.
-      coordinates: `coordinates(State) -> [2]`; what wraps may be out of its range.
+      wraps: for each, whether both ends of the range are the same state.
+      coordinates: `coordinates(State) -> [2]`; a coordinate that wraps may be out of its range.
       observe: `observe(x, y) -> obs`.
     """
 
@@ -47,14 +47,14 @@ class PhasePlane(NamedTuple):
     observe: Callable[[jax.Array, jax.Array], jax.Array]
 
 
-def scene(env: Any) -> Scene | None:
-    """How the states of `env` look; None where there is nothing to be seen, as of the quadratic problem."""
+def find_scene(env: Any) -> Scene | None:
+    """How the states of `env` look; None if it cannot be drawn, like the quadratic problem."""
     if hasattr(env, "scene"):
         return env.scene
     model = getattr(getattr(env, "sys", None), "mj_model", None)  # brax's
     return Scene(model, lambda state: state.pipeline_state.q) if model is not None else None
 
 
-def references(env: Any) -> Mapping[str, float]:
-    """Returns to compare with, by what they are; empty where the environment knows none."""
+def find_references(env: Any) -> Mapping[str, float]:
+    """Returns to compare with, by label; empty if the environment has none."""
     return getattr(env, "references", {})

@@ -1,4 +1,4 @@
-"""Where an exception comes from when a user's own code raises it."""
+"""Reports exceptions in a user's own code, with their place."""
 
 from __future__ import annotations
 
@@ -11,19 +11,19 @@ from typing import Any
 from envs.options import OptionError
 from envs.physics import MujocoModelError
 
-# Through whose frames an exception passes on its way from a user's function.
-PASSED_THROUGH = {"envs", "jaxpg", "jax", "jaxlib", "flax", "numpy", "mujoco", "brax"} | set(sys.stdlib_module_names)
+# Modules whose frames are skipped on the way to the user's function.
+LIBRARIES = {"envs", "jaxpg", "jax", "jaxlib", "flax", "numpy", "mujoco", "brax"} | set(sys.stdlib_module_names)
 
 
 @contextlib.contextmanager
-def user_code(name: str, doing: str, code: Any) -> Iterator[None]:
-    """An exception inside becomes one line that says what raised it and where; its traceback is the line's cause.
+def catch_user_errors(name: str, doing: str, code: Any) -> Iterator[None]:
+    """Turns an exception in the block into one line that says what raised it and where, with the exception as cause.
 
     Args:
-      name: of the environment.
+      name: name of the environment.
       doing: what is called, such as "step".
-      code: what is called, or whose method it is. Of this package's own environments an exception is no mistake of the
-        user, and stays what it is.
+      code: the function that is called, or the object whose method it is. Exceptions of this package's own environments
+        are not the user's mistake, and pass unchanged.
 
     Raises:
       OptionError: the line.
@@ -35,15 +35,17 @@ def user_code(name: str, doing: str, code: Any) -> Iterator[None]:
     except Exception as error:
         if (getattr(code, "__module__", None) or "").partition(".")[0] == "envs":
             raise
-        said = (str(error).splitlines() or [""])[0]
-        problem = f"env={name}: {doing} raises {type(error).__name__}{_place(error)}" + (f": {said}" if said else "")
+        text = (str(error).splitlines() or [""])[0]
+        problem = f"env={name}: {doing} raises {type(error).__name__}{_find_place(error)}" + (
+            f": {text}" if text else ""
+        )
         raise OptionError([problem]) from error
 
 
-def _place(error: Exception) -> str:
-    """` at FILE:LINE`, of the innermost frame that is neither a library's nor ours; empty where there is none."""
+def _find_place(error: Exception) -> str:
+    """` at FILE:LINE` of the innermost frame outside of libraries and this package; empty if there is none."""
     for frame, line in reversed(list(traceback.walk_tb(error.__traceback__))):
         module = frame.f_globals.get("__name__", "").partition(".")[0]
-        if module not in PASSED_THROUGH:
+        if module not in LIBRARIES:
             return f" at {frame.f_code.co_filename}:{line}"
     return ""

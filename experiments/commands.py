@@ -18,7 +18,7 @@ from matplotlib.figure import Figure
 from jaxpg.errors import UserError
 from jaxpg.store.folder import RunFolder, read_metrics
 from jaxpg.store.statistics import bootstrap_interval, interquartile_mean
-from jaxpg.watch.figures import draw_curve, series
+from jaxpg.watch.figures import draw_curve, select_series
 
 RESULTS = Path(__file__).parent / "results"
 
@@ -83,7 +83,7 @@ def evaluate(folder: Path, *arguments: str) -> dict[str, Any]:
 
 def learning_curve(axes: Axes, folder: Path, metric: str, label: str) -> dict[str, Any]:
     """Draws a metric of the run in `folder` over its steps; returns what was drawn, for `write_json`."""
-    steps, values = series(read_metrics(RunFolder(folder)), metric)
+    steps, values = select_series(read_metrics(RunFolder(folder)), metric)
     draw_curve(axes, steps, values, label)
     low, high = bootstrap_interval(values)
     return {

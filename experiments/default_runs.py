@@ -19,7 +19,7 @@ from pathlib import Path
 
 from commands import Parser, evaluate, train, write_json
 
-from envs.options import unknown
+from envs.options import describe_unknown
 from jaxpg.commands.ending import run_command
 
 PENDULUM_RUNS = {"default": ((), 10), "TD": (("algo=td",), 5), "TD(0)": (("algo=td", "algo.lambda_=0"), 5)}  # seeds
@@ -68,7 +68,7 @@ def main(arguments: Sequence[str]) -> None:
     tasks = parser.parse_args(arguments).tasks or list(TASKS)
     for task in tasks:
         if task not in TASKS:
-            parser.error(unknown("task", task, TASKS))
+            parser.error(describe_unknown("task", task, TASKS))
     with tempfile.TemporaryDirectory() as folder:
         os.environ["XDG_CACHE_HOME"] = folder  # the first run of each kind compiles, whatever was run before
         for task in tasks:

@@ -27,8 +27,8 @@ from commands import Parser, evaluate, largest_difference, train, write_json
 
 from jaxpg.commands.ending import run_command
 from jaxpg.deploy import c, onnx
-from jaxpg.deploy.controller import commanding, controller, observations
-from jaxpg.deploy.export import FORMATS
+from jaxpg.deploy.controller import collect_observations, make_command, make_controller
+from jaxpg.deploy.exporter import FORMATS
 from jaxpg.store import policies
 
 TASK = "pendulum"
@@ -80,10 +80,10 @@ def in_c(name: str, folder: Path) -> dict[str, Any]:
     texts = {"timed.c": TIMED, "alone.c": ALONE}
     for file, text in texts.items():
         (folder / file).write_text(text.replace("policy", name).replace("POLICY", name.upper()), encoding="utf-8")
-    build = [c.compiler(), "-O2", "-lm", f"-DLOOPS={LOOPS}", "-o", "timed", "timed.c", "-lm"]
+    build = [c.find_compiler(), "-O2", "-lm", f"-DLOOPS={LOOPS}", "-o", "timed", "timed.c", "-lm"]
     subprocess.run(build, check=True, cwd=folder)
     runs = [subprocess.run(["./timed"], check=True, capture_output=True, text=True, cwd=folder) for _ in range(5)]
-    subprocess.run([c.compiler(), "-std=c99", "-Os", "-fstack-usage", "-c", "alone.c"], check=True, cwd=folder)
+    subprocess.run([c.find_compiler(), "-std=c99", "-Os", "-fstack-usage", "-c", "alone.c"], check=True, cwd=folder)
     sizes = subprocess.run(["size", "alone.o"], check=True, capture_output=True, text=True, cwd=folder).stdout
     text, data, bss, *_ = (int(x) for x in sizes.splitlines()[1].split()[:3])
     stack = max(int(line.split("\t")[1]) for line in (folder / "alone.su").read_text().splitlines())
@@ -101,8 +101,8 @@ def main(arguments: Sequence[str] = ()) -> None:
         run, folder = Path(place) / "run", Path(place)
         train(run, f"env={TASK}")
         stored = policies.load(str(run))
-        control, command = controller(stored, {"policy": "an experiment's"}), jax.jit(commanding(stored))
-        obs = observations(stored)
+        control, command = make_controller(stored, {"policy": "an experiment's"}), jax.jit(make_command(stored))
+        obs = collect_observations(stored)
         expected, differences = np.asarray(command(obs), np.float64), {}
         for name, way in FORMATS.items():
             way.write(control, folder, command)

@@ -32,8 +32,8 @@ import numpy as np
 from commands import Parser, largest_difference, train, write_json
 
 from jaxpg.commands.ending import run_command
-from jaxpg.deploy import c, learning
-from jaxpg.deploy.controller import Controller, commanding, controller, observations
+from jaxpg.deploy import c, learner_replay
+from jaxpg.deploy.controller import Controller, collect_observations, make_command, make_controller
 from jaxpg.errors import UserError
 from jaxpg.program.networks import make_networks
 from jaxpg.store import policies
@@ -224,17 +224,17 @@ def lengths(instructions: np.ndarray, megahertz: int) -> dict[str, float]:
 
 def a_controller(stored: StoredPolicy, control: Controller, folder: Path) -> dict[str, Any]:
     """The commands for 10,000 observations."""
-    obs = observations(stored)
-    expected = np.asarray(jax.jit(commanding(stored))(obs), np.float64)
+    obs = collect_observations(stored)
+    expected = np.asarray(jax.jit(make_command(stored))(obs), np.float64)
     return compared(folder, CONTROLLER, obs, c.load(control, folder)(obs), expected)
 
 
 def a_learner(stored: StoredPolicy, control: Controller, folder: Path) -> dict[str, Any]:
     """The parameters after each of 1,000 updates."""
-    transition, networks = learning.steps(stored), make_networks(stored.config, stored.env)
-    expected = learning.learned(networks, stored.config.algo, stored.policy, control.learner.log_std, transition)
-    rows = learning.rows(transition)
-    return compared(folder, LEARNER, rows, c.program(control, folder / "learn.c")(rows), np.asarray(expected))
+    transition, networks = learner_replay.collect_steps(stored), make_networks(stored.config, stored.env)
+    expected = learner_replay.learn(networks, stored.config.algo, stored.policy, control.learner.log_std, transition)
+    rows = learner_replay.to_rows(transition)
+    return compared(folder, LEARNER, rows, c.compile_example(control, folder / "learn.c")(rows), np.asarray(expected))
 
 
 def main(arguments: Sequence[str]) -> int:
@@ -247,7 +247,7 @@ def main(arguments: Sequence[str]) -> int:
             folder = Path(place)
             train(folder / "run", *options)
             stored = policies.load(str(folder / "run"))
-            control = controller(stored, {"policy": "an experiment's"})._replace(name="policy")
+            control = make_controller(stored, {"policy": "an experiment's"})._replace(name="policy")
             c.write(control, folder)
             result[name] = tried(stored, control, folder)
     print(json.dumps(result, indent=1), file=sys.stderr)

@@ -30,7 +30,7 @@ MEASURED = "--measured"  # a process of this script that is the command, and not
 # Phases by what is called in them, of `jaxpg`.
 PHASES = {
     "options": ("config.parsing.compose",),
-    "environment": ("run.session._env",),
+    "environment": ("run.session._make_env",),
     "tracing and compiling": ("run.session._compile",),
     "evaluations": ("run.loop._evaluate",),
     "checkpoints": ("store.keeper.Keeper.__init__", "store.keeper.Keeper.save"),

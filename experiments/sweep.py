@@ -29,7 +29,7 @@ from jaxpg.program.compile import compile_program
 from jaxpg.program.environment import make_env
 from jaxpg.program.schedule import plan
 from jaxpg.program.state import current_policy
-from jaxpg.store.names import own_metrics
+from jaxpg.store.names import rename_metrics
 
 # Drawn log-uniformly between the two; discount and lambda by what they lack of 1.
 RANGES = {
@@ -59,7 +59,7 @@ def results(config: Config, settings: list[Setting], num_seeds: int) -> dict[str
     program = compile_program(config, make_env(config), plan(config).num_updates, agents)
     train, _ = program.advance(program.init().train)
     episodes = program.evaluate(current_policy(train))
-    found = {"return": episodes.episode_return, **own_metrics(episodes.metrics)}
+    found = {"return": episodes.episode_return, **rename_metrics(episodes.metrics)}
     return {name: np.asarray(x).reshape(len(settings), -1).mean(axis=1) for name, x in found.items()}
 
 

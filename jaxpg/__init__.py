@@ -31,7 +31,7 @@ LIBRARY = (*MATHS, *PROGRAMS, "training", "evaluation")
 __all__ = ["__version__", "load", *LIBRARY]
 
 if TYPE_CHECKING:
-    from jaxpg.deploy.policy import Policy
+    from jaxpg.deploy.python_policy import Policy
 
 
 def __getattr__(name: str) -> ModuleType:
@@ -60,6 +60,6 @@ def load(run: str | os.PathLike[str], checkpoint: str = "best", agent: int | Non
     Raises:
       jaxpg.errors.UserError: no run folder, no checkpoint in it, no such agent, or an unknown environment.
     """
-    from jaxpg.deploy import policy  # with the environments, slow to import
+    from jaxpg.deploy import python_policy  # with the environments, slow to import
 
-    return policy.load(run, checkpoint, agent)
+    return python_policy.load(run, checkpoint, agent)

@@ -11,7 +11,7 @@ from __future__ import annotations
 import importlib
 from collections.abc import Sequence
 
-from envs.options import unknown
+from envs.options import describe_unknown
 from jaxpg.commands.ending import run_command
 from jaxpg.errors import UserError
 
@@ -34,7 +34,7 @@ def main(arguments: Sequence[str]) -> int:
         print("\n".join(["usage: jaxpg VERB [option=value] ...", "", *lines, "", "jaxpg VERB --help says more"]))
         return 0
     if verb not in VERBS:
-        raise UserError(unknown("command", verb, VERBS))
+        raise UserError(describe_unknown("command", verb, VERBS))
     return importlib.import_module(f"jaxpg.commands.{verb}").main(rest)
 
 

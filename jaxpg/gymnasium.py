@@ -6,8 +6,8 @@
     env = gymnasium.make("jaxpg/Pendulum-v0", mass=2.0)
     envs = gymnasium.make_vec("jaxpg/Arm-v0", num_envs=64)
 
-Gymnasium looks for no plug-ins, but imports what stands before a colon: `jaxpg.gymnasium:jaxpg/Pendulum-v0` is a name
-that any tool which takes names can use. JAX and MuJoCo are not loaded before an environment is made.
+Gymnasium does not search for plug-ins, but imports the module before a colon: any tool that takes names can use
+`jaxpg.gymnasium:jaxpg/Pendulum-v0`. JAX and MuJoCo are loaded only when an environment is made.
 """
 
 import gymnasium

@@ -10,7 +10,7 @@ from jaxpg.config.parsing import compose
 from jaxpg.normalization import RunningStatistics
 from jaxpg.program.networks import make_networks
 from jaxpg.program.state import Policy
-from jaxpg.store.policies import stored_policy
+from jaxpg.store.policies import make_stored_policy
 
 
 @functools.cache
@@ -32,4 +32,4 @@ def a_policy(*options):
         variance=jnp.exp(jax.random.normal(next(keys), (env.observation_size,))),
     )
 
-    return stored_policy(config, env, Policy(params, normalizer), update=1, agent="seed 0")
+    return make_stored_policy(config, env, Policy(params, normalizer), update=1, agent="seed 0")

@@ -198,8 +198,8 @@ def finished(command, tmp_path_factory):
 
 
 RUN_MISTAKES = {
-    "folder in use": (train, ["run_dir={run}"], "is not empty: take another run_dir, or resume="),
-    "folder whose name has two lines": (train, ["run_dir={run}/a\nb"], "expected letters that can be printed"),
+    "folder in use": (train, ["run_dir={run}"], "is not empty: choose another run_dir, or resume="),
+    "folder whose name has two lines": (train, ["run_dir={run}/a\nb"], "expected printable characters"),
     "folder with too long a name": (
         train,
         ["run_dir={run}/" + 300 * "x"],
@@ -291,7 +291,7 @@ DAMAGES = {
     "versions.json of another kind": (lambda folder: (folder / "versions.json").write_text("[]"), "not what a run"),
     "threads in words": (
         lambda folder: (folder / "versions.json").write_text('{"threads": "two"}'),
-        "not what a run writes there, an object whose threads is at least 1",
+        "not written by a run: expected an object with threads from 1 to ",
     ),
 }
 

@@ -13,8 +13,8 @@ from jaxpg.config.parsing import compose
 from jaxpg.errors import UserError
 from jaxpg.store.statistics import bootstrap_interval, interquartile_mean, probability_of_improvement
 from jaxpg.watch import publication
-from jaxpg.watch.comparison import COLUMNS, comparison, notes, table
-from jaxpg.watch.methods import methods, standings
+from jaxpg.watch.comparison import COLUMNS, build_comparison, make_table, write_notes
+from jaxpg.watch.methods import compute_standings, read_methods
 
 
 @pytest.fixture
@@ -41,12 +41,12 @@ def run(tmp_path):
 def test_runs_that_differ_in_their_seeds_are_one_method(run):
     folders = [run(f"{seed}", [[-1.0 * seed], [2.0 * seed]], f"seed={seed}") for seed in range(3)]
     folders.append(run("more", [[5.0, 6.0], [7.0, 8.0], [9.0, 9.0]], "seed=3", "num_seeds=2", "total_steps=300"))
-    (method,) = methods(folders)
+    (method,) = read_methods(folders)
     assert method.label == "algo=ppo"
     steps, values = method.values("eval_return")
     assert steps.tolist() == [100, 200]  # where all of them have one
     assert values.tolist() == [[0, 0], [-1, 2], [-2, 4], [5, 7], [6, 8]]
-    assert standings([method])[0].returns.tolist() == [0, 2, 4, 7, 8]
+    assert compute_standings([method])[0].returns.tolist() == [0, 2, 4, 7, 8]
 
 
 def test_a_label_says_what_distinguishes_and_no_more(run):
@@ -56,7 +56,7 @@ def test_a_label_says_what_distinguishes_and_no_more(run):
         run("c", [-1.0], "algo=reinforce"),
     ]
     # The tuned options of TD and REINFORCE differ in many ways, which their names say already.
-    assert [method.label for method in methods(folders)] == [
+    assert [method.label for method in read_methods(folders)] == [
         "algo=reinforce algo.gamma=0.977",
         "algo=td algo.gamma=0.9",
         "algo=td algo.gamma=0.97",
@@ -65,10 +65,10 @@ def test_a_label_says_what_distinguishes_and_no_more(run):
 
 def test_each_setting_of_a_sweep_is_a_method(run):
     folder = run("swept", [[1.0, 2.0, 3.0, 4.0]], "num_seeds=2", "sweep.algo.gamma=[0.5,0.9]")
-    found = {one.method.label: one.returns.tolist() for one in standings(methods([folder]))}
+    found = {one.method.label: one.returns.tolist() for one in compute_standings(read_methods([folder]))}
     assert found == {"algo.gamma=0.9": [3, 4], "algo.gamma=0.5": [1, 2]}
     alone = run("alone", [10.0], "seed=7", "algo.gamma=0.5")
-    found = {one.method.label: one.returns.tolist() for one in standings(methods([folder, alone]))}
+    found = {one.method.label: one.returns.tolist() for one in compute_standings(read_methods([folder, alone]))}
     assert found["algo.gamma=0.5"] == [1, 2, 10]
 
 
@@ -78,8 +78,8 @@ def test_the_best_is_the_first_and_its_improvement_is_probable(run):
         run("low", [low], "num_seeds=4", "algo.gamma=0.5"),
         run("high", [high], "num_seeds=4", "algo.gamma=0.9"),
     ]
-    found = methods(folders)
-    data = comparison(found)
+    found = read_methods(folders)
+    data = build_comparison(found)
     assert data["improvement"]["labels"] == ["algo.gamma=0.9", "algo.gamma=0.5"]
     probability = data["improvement"]["probability"]
     assert probability[0][1] == probability_of_improvement(np.array(high), np.array(low)) == 13 / 16
@@ -87,7 +87,7 @@ def test_the_best_is_the_first_and_its_improvement_is_probable(run):
     assert probability[0][0] is None
     assert 0 <= data["improvement"]["low"][0][1] <= 13 / 16 <= data["improvement"]["high"][0][1] <= 1
     mean = f"{interquartile_mean(np.array(high)):.1f}"
-    assert table(found)[0] == ["algo.gamma=0.9", f"{mean} (2.5 to 9.0)", "4", "100"]
+    assert make_table(found)[0] == ["algo.gamma=0.9", f"{mean} (2.5 to 9.0)", "4", "100"]
     assert ["env", "pendulum"] in data["configuration"]
     assert "algo.gamma" not in dict(data["configuration"])
 
@@ -99,22 +99,22 @@ def test_too_few_seeds_are_sure_of_nothing(run, few, many):
         run("a", [[100.0 + i for i in range(few)]], "algo=ppo", f"num_seeds={few}"),
         run("b", [[1.0 * i for i in range(many)]], "algo=td", f"num_seeds={many}"),
     ]
-    found = methods(folders)
-    data = comparison(found)["improvement"]
+    found = read_methods(folders)
+    data = build_comparison(found)["improvement"]
     assert data["probability"][0][1] == 1
     assert [row for row in data["low"] + data["high"] if any(end is not None for end in row)] == []
-    assert "[" not in table(found)[0][1]
-    assert any("fewer than 6 seeds carry no 95 % interval" in line for line in notes(found))
+    assert "[" not in make_table(found)[0][1]
+    assert any("a 95 % interval needs at least 6 seeds" in line for line in write_notes(found))
 
 
 def test_enough_seeds_have_an_interval_and_no_note(run):
     scores = [[10.0 + i for i in range(6)]], [[1.0 * i for i in range(6)]]
     folders = [run(str(i), rows, f"algo.gamma=0.{i + 1}", "num_seeds=6") for i, rows in enumerate(scores)]
-    found = methods(folders)
-    data = comparison(found)["improvement"]
+    found = read_methods(folders)
+    data = build_comparison(found)["improvement"]
     assert 0.5 < data["low"][0][1] < data["probability"][0][1] == data["high"][0][1] == 1
-    assert [row[1].count("[") for row in table(found)] == [1, 1]
-    assert notes(found) == []
+    assert [row[1].count("[") for row in make_table(found)] == [1, 1]
+    assert write_notes(found) == []
 
 
 def test_runs_of_unequal_steps_are_compared_at_equal_steps(run):
@@ -123,12 +123,15 @@ def test_runs_of_unequal_steps_are_compared_at_equal_steps(run):
         run("long", [-9.0, -8.0, -7.0, -1.0], "algo=td", "total_steps=400"),
         run("short", [-6.0, -5.0], "algo=ppo", "total_steps=200"),
     ]
-    found = methods(folders)
-    assert [row[:2] + row[-1:] for row in table(found)] == [["algo=ppo", "-5.0", "200"], ["algo=td", "-8.0", "200"]]
-    assert comparison(found)["improvement"]["probability"] == [[None, 1], [0, None]]
-    (said,) = [line for line in notes(found) if "compared at 200 environment steps" in line]
-    assert "algo=td went on to 400" in said
-    assert [series["steps"][-1] for series in comparison(found)["curves"][0]["series"]] == [200, 400]
+    found = read_methods(folders)
+    assert [row[:2] + row[-1:] for row in make_table(found)] == [
+        ["algo=ppo", "-5.0", "200"],
+        ["algo=td", "-8.0", "200"],
+    ]
+    assert build_comparison(found)["improvement"]["probability"] == [[None, 1], [0, None]]
+    (said,) = [line for line in write_notes(found) if "compared at 200 environment steps" in line]
+    assert "algo=td trained until 400" in said
+    assert [series["steps"][-1] for series in build_comparison(found)["curves"][0]["series"]] == [200, 400]
 
 
 def test_where_nobody_was_evaluated_at_the_same_steps_the_nearest_count_and_it_is_said(run):
@@ -136,9 +139,12 @@ def test_where_nobody_was_evaluated_at_the_same_steps_the_nearest_count_and_it_i
         run("a", [-9.0, -8.0, -7.0], "algo=td"),
         run("b", [-6.0, -5.0], "algo=ppo", every=115),
     ]
-    found = methods(folders)
-    assert [row[:2] + row[-1:] for row in table(found)] == [["algo=ppo", "-5.0", "230"], ["algo=td", "-8.0", "200"]]
-    assert any("not evaluated at 230 steps, but near it: algo=td at 200" in line for line in notes(found))
+    found = read_methods(folders)
+    assert [row[:2] + row[-1:] for row in make_table(found)] == [
+        ["algo=ppo", "-5.0", "230"],
+        ["algo=td", "-8.0", "200"],
+    ]
+    assert any("not evaluated at 230 steps, but nearby: algo=td at 200" in line for line in write_notes(found))
 
 
 def test_a_table_is_csv_with_intervals_where_there_are_some(run, tmp_path, capsys):
@@ -183,7 +189,7 @@ def test_a_figure_can_be_read_without_its_colours(run, monkeypatch):
     monkeypatch.setattr(matplotlib.figure.Figure, "savefig", lambda self, *_, **__: drawn.append(self))
     names = [f"0.{i:02}" for i in range(10, 38)]
     folders = [run(name, [-1.0, 0.0], f"algo.gamma={name}") for name in names]
-    publication.figure(methods(folders), "pdf")
+    publication.draw_figure(read_methods(folders), "pdf")
     lines = drawn[0].axes[0].get_lines()
     assert len({(line.get_linestyle(), line.get_marker()) for line in lines}) == len(names)
 
@@ -197,28 +203,31 @@ def test_another_ending_is_refused_before_anything_is_read(tmp_path, monkeypatch
 
 
 def test_success_is_shown_where_there_is_one(run):
-    found = methods([run("arm", [-1.0, -2.0], "env=arm", success=0.75)])
-    assert table(found) == [["algo=ppo", "-2.0", "75.0 %", "1", "200"]]
-    assert [panel["title"] for panel in comparison(found)["curves"]] == ["return", "success rate"]
-    assert [len(row) for row in table(methods([run("pendulum", [-1.0])]))] == [len(COLUMNS) - 1]
+    found = read_methods([run("arm", [-1.0, -2.0], "env=arm", success=0.75)])
+    assert make_table(found) == [["algo=ppo", "-2.0", "75.0 %", "1", "200"]]
+    assert [panel["title"] for panel in build_comparison(found)["curves"]] == ["return", "success rate"]
+    assert [len(row) for row in make_table(read_methods([run("pendulum", [-1.0])]))] == [len(COLUMNS) - 1]
 
 
 @pytest.mark.parametrize(
     ("runs", "message"),
     [
-        ([("a", "env=arm"), ("b", "env=pendulum")], "can be compared: arm in .*a; pendulum in .*b"),
+        (
+            [("a", "env=arm"), ("b", "env=pendulum")],
+            "can only be compared in the same environment: arm in .*a; pendulum in .*b",
+        ),
         (
             [("a", "env=brax"), ("b", "env=brax", "env.name=ant")],
-            "of one environment can be compared: ant in .*b; inverted_pendulum in .*a",
+            "in the same environment: ant in .*b; inverted_pendulum in .*a",
         ),
-        ([("a", "seed=1"), ("b", "seed=1")], "seed 1 is there twice"),
-        ([("a", "seed=1"), ("none", "seed=2")], "no evaluation that all its runs have made"),
+        ([("a", "seed=1"), ("b", "seed=1")], "seed 1 occurs twice"),
+        ([("a", "seed=1"), ("none", "seed=2")], "its runs have no evaluation in common"),
     ],
 )
 def test_what_cannot_be_compared_is_said(run, runs, message):
     folders = [run(name, [] if name == "none" else [-1.0], *options) for name, *options in runs]
     with pytest.raises(UserError, match=message):
-        methods(folders)
+        read_methods(folders)
 
 
 def test_the_command_takes_folders_with_any_name(run, tmp_path, capsys, monkeypatch):
@@ -231,7 +240,7 @@ def test_the_command_takes_folders_with_any_name(run, tmp_path, capsys, monkeypa
         ["algo=td", "-1.0", "1", "100"],
         ["algo=ppo", "-2.0", "1", "100"],
     ]
-    assert said[3:] == ["note: fewer than 6 seeds carry no 95 % interval", "both.html"]
+    assert said[3:] == ["note: a 95 % interval needs at least 6 seeds", "both.html"]
     assert "algo=ppo" in (tmp_path / "both.html").read_text()
 
 
@@ -243,7 +252,7 @@ def test_what_is_no_run_is_left_out_with_a_note(run, tmp_path, capsys, monkeypat
     (tmp_path / "comparison.html").write_text("<!DOCTYPE html>")
     (tmp_path / "notes").mkdir()
     assert compare.main(["a", "b", "comparison.html", "notes", "out=comparison.html"]) == 0
-    assert capsys.readouterr().out.startswith("note: left out, as it is no run folder: comparison.html, notes\n")
+    assert capsys.readouterr().out.startswith("note: skipped, not a run folder: comparison.html, notes\n")
     assert "algo=ppo" in (tmp_path / "comparison.html").read_text()
     with pytest.raises(UserError, match="nowhere is not a run folder"):
         compare.main(["a", "b", "nowhere", "out=comparison.html"])

@@ -82,32 +82,35 @@ MISTAKES = {
         {"metrics": lambda self, x: (x,)},
         "metrics of step are a tuple: expected a dict of scalars",
     ),
-    "a metric without a name": ({"metrics": lambda self, x: {3: x}}, "metrics of step: 3 is no name: expected a text"),
+    "a metric without a name": ({"metrics": lambda self, x: {3: x}}, "metrics of step: the name 3 is not a string"),
     "a metric that reset has not": (
         {"metrics": lambda self, x: {"distance": x, "height": x}},
-        "step gives state.metrics['height'], which reset does not",
+        "step returns state.metrics['height'], which reset does not",
     ),
     "a metric that step has not": (
         {"metrics": lambda self, x: {}},
-        "step leaves out state.metrics['distance'], which reset gives",
+        "step omits state.metrics['distance'], which reset returns",
     ),
     "a state that changes its type": (
         {"step": from_step(pipeline_state=Position(ONE, ONE))},
-        "step makes state.pipeline_state.steps float32[], which is int32[] after reset: they must be alike",
+        "step makes state.pipeline_state.steps float32[], but reset int32[]: they must be the same",
     ),
     "a state that changes its shape": (
         {"step": from_step(pipeline_state=Position(jnp.ones(3), jnp.zeros((), jnp.int32)))},
-        "step makes state.pipeline_state.x float32[3], which is float32[] after reset: they must be alike",
+        "step makes state.pipeline_state.x float32[3], but reset float32[]: they must be the same",
     ),
     "a state of another kind": (
         {"step": from_step(pipeline_state={"x": ONE})},
-        "step leaves out state.pipeline_state.x, which reset gives",
+        "step omits state.pipeline_state.x, which reset returns",
     ),
     "an array instead of a State": (
         {"reset": lambda self, rng: ONE},
-        "without obs, reward, done, metrics: expected what",
+        "without obs, reward, done, metrics: expected the fields",
     ),
-    "Gymnasium's tuple": ({"step": lambda self, state, action: (ONE, ONE, ONE)}, "step gives a tuple without obs, rew"),
+    "Gymnasium's tuple": (
+        {"step": lambda self, state, action: (ONE, ONE, ONE)},
+        "step returns a tuple without obs, rew",
+    ),
     "names for less": ({"interface": Interface(("x",), ("a",), None)}, "interface.observations is ('x',): expected 2"),
     "one name without its tuple": ({"interface": Interface(("x", "y"), "force", None)}, "interface.commands is"),
     "a limit for less": ({"interface": Interface(("x", "y"), ("a",), ())}, "interface.limits is (): expected 1 finite"),

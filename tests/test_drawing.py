@@ -30,7 +30,7 @@ def area(corners):
 @pytest.mark.parametrize("angle", [0.0, 0.6, np.pi / 2])
 def test_a_box_has_its_corners(angle):
     """Turned by the hinge about the line of sight: a rectangle, turned as much; no pill."""
-    picture = drawing.picture(model('<geom type="box" size=".4 .2 .1"/>'))
+    picture = drawing.make_picture(model('<geom type="box" size=".4 .2 .1"/>'))
     corners = silhouette(picture, drawing.draw(picture, np.array([[angle]])))
     turn = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
     expected = np.array([(x, z) for x in (-0.4, 0.4) for z in (-0.1, 0.1)]) @ turn.T
@@ -51,12 +51,12 @@ def test_a_box_has_its_corners(angle):
     ],
 )
 def test_a_geom_covers_what_it_covers(geom, expected, error):
-    picture = drawing.picture(model(geom, assets=MESH))
+    picture = drawing.make_picture(model(geom, assets=MESH))
     assert area(silhouette(picture, drawing.draw(picture, np.zeros((1, 1))))) == pytest.approx(expected, rel=error)
 
 
 def test_a_capsule_and_a_sphere_are_points_with_a_rim():
-    picture = drawing.picture(
+    picture = drawing.make_picture(
         model('<geom type="capsule" fromto="0 0 0 .5 0 0" size=".03"/><geom size=".2" pos="1 0 0"/>')
     )
     assert [(len(part.points), part.radius) for part in picture.parts] == [(2, 0.03), (1, 0.2)]
@@ -65,15 +65,15 @@ def test_a_capsule_and_a_sphere_are_points_with_a_rim():
 
 def test_what_is_nearer_is_drawn_over_what_is_farther():
     """The camera looks along +y."""
-    picture = drawing.picture(
+    picture = drawing.make_picture(
         model('<geom name="near" size=".1" pos="0 -1 0"/><geom name="far" size=".1" pos="0 1 0"/>')
     )
     assert [part.number for part in picture.parts] == [1, 0]
 
 
 def test_a_robot_of_collision_geoms_alone_is_drawn_of_them():
-    shown = drawing.picture(model('<geom size=".1" group="3"/>'))
-    both = drawing.picture(model('<geom size=".1" group="3"/><geom size=".2" group="2"/>'))
+    shown = drawing.make_picture(model('<geom size=".1" group="3"/>'))
+    both = drawing.make_picture(model('<geom size=".1" group="3"/><geom size=".2" group="2"/>'))
     assert [part.radius for part in shown.parts] == [0.1]
     assert [part.radius for part in both.parts] == [0.2]
 
@@ -83,7 +83,7 @@ def test_a_body_without_geoms_is_drawn_as_the_box_that_has_its_inertia():
     a, b, c, mass = 0.8, 0.4, 0.2, 3.0
     inertia = mass / 12 * np.array([b**2 + c**2, a**2 + c**2, a**2 + b**2])
     inertial = f'<inertial pos=".3 0 0" mass="{mass}" diaginertia="{inertia[0]} {inertia[1]} {inertia[2]}"/>'
-    picture = drawing.picture(model(inertial))
+    picture = drawing.make_picture(model(inertial))
     corners = silhouette(picture, drawing.draw(picture, np.zeros((1, 1))))
     np.testing.assert_allclose(corners.min(axis=0), [0.3 - a / 2, -c / 2], atol=1e-6)
     np.testing.assert_allclose(corners.max(axis=0), [0.3 + a / 2, c / 2], atol=1e-6)
@@ -91,13 +91,13 @@ def test_a_body_without_geoms_is_drawn_as_the_box_that_has_its_inertia():
 
 def test_of_a_model_without_anything_it_is_said():
     with pytest.raises(NotDrawn, match="no geoms and no bodies"):
-        drawing.picture(
+        drawing.make_picture(
             mujoco.MjModel.from_xml_string('<mujoco><worldbody><geom type="plane" size="1 1 1"/></worldbody></mujoco>')
         )
 
 
 def test_where_a_position_is_no_number_the_robot_stays_where_it_was():
-    picture = drawing.picture(model('<geom type="capsule" fromto="0 0 0 .5 0 0" size=".03"/>'))
+    picture = drawing.make_picture(model('<geom type="capsule" fromto="0 0 0 .5 0 0" size=".03"/>'))
     qpos = np.array([[np.nan], [0.3], [np.nan], [np.inf], [1.0]])
     frames = drawing.draw(picture, qpos)
     expected = drawing.draw(picture, np.array([[0.0], [0.3], [0.3], [0.3], [1.0]]))
@@ -108,7 +108,7 @@ def test_where_a_position_is_no_number_the_robot_stays_where_it_was():
 def test_a_robot_that_flies_off_does_not_make_the_rest_invisible():
     """A slide that passes 1e9 m: the picture is no larger than some tens of the robot's size."""
     xml = '<mujoco><worldbody><body><joint type="slide" axis="0 0 1"/><geom size=".1"/></body></worldbody></mujoco>'
-    picture = drawing.picture(mujoco.MjModel.from_xml_string(xml))
+    picture = drawing.make_picture(mujoco.MjModel.from_xml_string(xml))
     frames = drawing.draw(picture, np.array([[0.0], [0.5], [1e9], [1e12]]))
     _, y_min, _, y_max = drawing.extent(picture, [frames], margin=0.1)
     assert -10 < y_min < -0.1
@@ -128,4 +128,4 @@ def test_a_robot_that_flies_off_does_not_make_the_rest_invisible():
 )
 def test_the_axes_of_the_picture_are_named_as_what_the_camera_sees(xyaxes, labels):
     camera = f'<camera pos="0 0 3" xyaxes="{xyaxes}"/>' if xyaxes else ""
-    assert drawing.axis_labels(drawing.camera(model('<geom size=".1"/>', more=camera))) == labels
+    assert drawing.axis_labels(drawing.camera_axes(model('<geom size=".1"/>', more=camera))) == labels

@@ -20,7 +20,7 @@ from jaxpg.program.environment import make_env
 from jaxpg.program.schedule import described_jump, plan
 from jaxpg.program.state import state_shape
 from jaxpg.run import session
-from jaxpg.run.chunks import PATIENCE, Watch
+from jaxpg.run.chunks import PATIENCE, NonFiniteMonitor
 from jaxpg.training import initial_state, train_chunk, train_scan
 from jaxpg.types import Algorithm, TrainState
 
@@ -289,13 +289,13 @@ def test_a_run_that_stops_inside_a_chunk_ends_there(tmp_path, exploding_at, caps
     folder = tmp_path / "run"
     exploding_at(9)
     arguments = [*SIZES, f"log_interval={5 * STEPS}", f"run_dir={folder}"]
-    assert train.main(arguments) == session.EXPLODED
+    assert train.main(arguments) == session.DIVERGED_STATUS
     assert f"error: update 9: value_loss is not finite; stopped at {8 * STEPS} steps" in capsys.readouterr().out
     lines, number, _ = found = outcome(folder)
     assert number == 8
     assert [line["update"] for line in lines] == [5, 8]
     assert all(line["skipped"] == 0 for line in lines)
-    assert train.main([f"resume={folder}"]) == session.EXPLODED
+    assert train.main([f"resume={folder}"]) == session.DIVERGED_STATUS
     assert outcome(folder) == found
     assert train.main([f"resume={folder}", "nan_policy=skip"]) == 0
     assert updates_of(folder) == [5, 8, 10, 15, 20]
@@ -338,13 +338,13 @@ def _updates_of_agents(folder):
 
 def looked(policy, *rows, patience=PATIENCE):
     """Whether nobody goes on, after chunks of such updates; 1 is unsound."""
-    watch = Watch(compose(["num_seeds=2", f"nan_policy={policy}"]), lambda text: None, patience)
+    monitor = NonFiniteMonitor(compose(["num_seeds=2", f"nan_policy={policy}"]), lambda text: None, patience)
     for row in rows:
         unsound = np.broadcast_to(np.asarray(row, int), (2, np.shape(row)[-1]))
         nothing = np.zeros(unsound.shape)
         metrics = {"nonfinite": unsound, "nonfinite_env": nothing - 1, "diverged": nothing, "value_loss": nothing}
-        watch.look(TrainState(None, None, None, None, np.zeros(2, int)), metrics)
-    return watch.nobody_goes_on
+        monitor.observe(TrainState(None, None, None, None, np.zeros(2, int)), metrics)
+    return monitor.is_stuck
 
 
 def test_who_stops_does_not_go_on_and_who_skips_has_patience():
@@ -364,6 +364,6 @@ def test_a_run_none_of_whose_updates_can_be_applied_says_so(tmp_path, exploding_
     exploding_at(*range(1, UPDATES + 1))
     folder = tmp_path / "run"
     arguments = [*SIZES, "log_interval=8", "nan_policy=skip", f"run_dir={folder}"]
-    assert train.main(arguments) == session.EXPLODED
+    assert train.main(arguments) == session.DIVERGED_STATUS
     assert f"the last {UPDATES} updates could not be applied" in capsys.readouterr().out
     assert outcome(folder)[1] == UPDATES

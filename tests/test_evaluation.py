@@ -14,10 +14,10 @@ from exploding import Blind, ExplodingConfig, Falls, Servo
 from hypothesis import given
 from hypothesis import strategies as st
 
-from jaxpg.commands.evaluate import _rows
+from jaxpg.commands.evaluate import _format_results
 from jaxpg.evaluation import evaluate, play
 from jaxpg.program.state import Best, better
-from jaxpg.store.statistics import counted_returns
+from jaxpg.store.statistics import penalize_diverged
 from jaxpg.watch import closing
 from jaxpg.watch.episodes import Results
 
@@ -76,18 +76,18 @@ returns = st.lists(st.floats(-1e6, 1e6), min_size=1, max_size=8)
 def test_a_diverged_episode_never_looks_good(values, data):
     """It counts no more than any sound one and no more than 0, whatever it earned; the sound ones stay as they are."""
     mask = np.array(data.draw(st.lists(st.booleans(), min_size=len(values), max_size=len(values))))
-    counted = counted_returns(np.array(values), mask)
+    counted = penalize_diverged(np.array(values), mask)
     np.testing.assert_array_equal(counted[~mask], np.array(values)[~mask])
     if mask.all():
         assert np.isnan(counted).all()
     else:
         assert (counted[mask] <= min(0.0, counted[~mask].min())).all()
-        spoiled = counted_returns(np.where(mask, np.nan, values), mask)
+        spoiled = penalize_diverged(np.where(mask, np.nan, values), mask)
         np.testing.assert_array_equal(spoiled, counted)
 
 
 def test_rows_are_counted_apart():
-    found = counted_returns(np.array([[1.0, 2.0], [-1.0, 5.0]]), np.array([[True, True], [False, True]]))
+    found = penalize_diverged(np.array([[1.0, 2.0], [-1.0, 5.0]]), np.array([[True, True], [False, True]]))
     np.testing.assert_array_equal(found, [[np.nan, np.nan], [-1.0, -1.0]])
 
 
@@ -175,17 +175,17 @@ def test_an_observation_out_of_bounds_ends_in_one_line(program, tmp_path):
 def test_what_is_no_number_is_said_in_words():
     nothing, mixed = np.full(2, np.nan), np.array([np.nan, 0.5])
     metrics = {"success": nothing, "distance": nothing, "height": mixed}
-    rows = _rows(Results(np.array([1.0, 2.0]), np.zeros(2, bool), metrics))
+    rows = _format_results(Results(np.array([1.0, 2.0]), np.zeros(2, bool), metrics))
     assert (rows["success"], rows["distance"]) == ("n/a", "n/a")
     assert rows["height"].startswith("0.5 ")
 
 
 def test_of_several_agents_it_is_said_how_many_have_the_untrained_policy():
     lines = [{"eval_return": [None, 1.0, 2.0], "eval_diverged": [8, 0, 1]}]
-    rows = closing._evaluated(lines)
+    rows = closing._summarize_evaluations(lines)
     assert rows["best policy"].startswith("the untrained one of 1 of the 3 agents: ")
     assert rows["diverged"] == "9 episodes of the last evaluation"
-    assert "best policy" not in closing._evaluated([{"eval_return": [1.0, 2.0]}])
+    assert "best policy" not in closing._summarize_evaluations([{"eval_return": [1.0, 2.0]}])
 
 
 def test_a_run_all_of_whose_episodes_diverge_calls_no_policy_best(program, tmp_path):

@@ -15,9 +15,9 @@ from jaxpg import evaluate
 from jaxpg import export as command_line
 from jaxpg.config.parsing import compose
 from jaxpg.config.schema import ACTIVATIONS, FEATURES
-from jaxpg.deploy import c, header, learning, onnx, reference, stablehlo
-from jaxpg.deploy.controller import commanding, controller, observations
-from jaxpg.deploy.export import FORMATS, TOLERANCE, trial
+from jaxpg.deploy import c, header, learner_replay, onnx, reference, stablehlo
+from jaxpg.deploy.controller import collect_observations, make_command, make_controller
+from jaxpg.deploy.exporter import FORMATS, TOLERANCE, make_trial
 from jaxpg.errors import UserError
 from jaxpg.program.networks import make_networks
 from jaxpg.types import Transition
@@ -45,10 +45,10 @@ def written(tmp_path_factory):
     def make(name):
         if name not in made:
             stored, folder = a_policy(*POLICIES[name]), tmp_path_factory.mktemp("export")
-            control, command = controller(stored, {"policy": "drawn by a test"}), commanding(stored)
+            control, command = make_controller(stored, {"policy": "drawn by a test"}), make_command(stored)
             for way in FORMATS.values():
                 way.write(control, folder, command)
-            made[name] = control, folder, command, observations(stored)
+            made[name] = control, folder, command, collect_observations(stored)
         return made[name]
 
     return make
@@ -66,7 +66,7 @@ def test_commands_are_the_formulas(name, form, written):
     """In units of the limit, against float64; JAX's too."""
     control, folder, command, obs = written(name)
     assert obs.shape == (10_000, control.observation_size)
-    tried = trial(control, obs)
+    tried = make_trial(control, obs)
     assert tried.exact.std() > 0.01  # they differ, and are not all at a limit
     found = np.asarray(jax.jit(command)(obs)) if form == "jax" else FORMATS[form].load(control, folder)(obs)
     assert found.shape == (10_000, control.action_size)
@@ -78,7 +78,7 @@ def test_c_with_double_is_the_formula_in_double(name, written):
     """To 1e-12, where float has 1e-7: by numpy's own arithmetic."""
     control, folder, _, obs = written(name)
     found = c.load(control, folder, double=True)(obs[::10])
-    np.testing.assert_allclose(found, reference.commands(control, obs[::10]), rtol=0, atol=1e-12)
+    np.testing.assert_allclose(found, reference.compute_commands(control, obs[::10]), rtol=0, atol=1e-12)
 
 
 def test_the_header_says_what_it_is(written):
@@ -156,16 +156,18 @@ def some_steps(stored, number=1000):
 def test_a_thousand_updates_in_c_are_those_of_jax(name, double, tmp_path):
     """Every parameter after every update: to 1e-4 in float, to 1e-9 in double."""
     stored = a_policy(*LEARNERS[name])
-    control, transition = controller(stored, {}), some_steps(stored)
+    control, transition = make_controller(stored, {}), some_steps(stored)
     c.write(control, tmp_path)
     networks = make_networks(stored.config, stored.env)
-    found = c.program(control, tmp_path / "learn.c", double)(learning.rows(transition))
+    found = c.compile_example(control, tmp_path / "learn.c", double)(learner_replay.to_rows(transition))
     with jax.enable_x64(double):
         kind = np.float64 if double else np.float32
         policy, steps = jax.tree.map(lambda x: jnp.asarray(np.asarray(x, kind)), (stored.policy, transition))
         scale = np.asarray(control.scale, kind)  # what is written is rounded to float
         policy = policy._replace(normalizer=policy.normalizer._replace(variance=jnp.asarray(scale**-2)))
-        expected = learning.learned(networks, stored.config.algo, policy, control.learner.log_std.astype(kind), steps)
+        expected = learner_replay.learn(
+            networks, stored.config.algo, policy, control.learner.log_std.astype(kind), steps
+        )
         assert expected.dtype == kind
         expected = np.asarray(expected)
     assert found.shape == expected.shape
@@ -197,11 +199,11 @@ int main(void) {
 def test_a_sample_of_the_learner_is_the_policys(tmp_path):
     """With noise 0 the command is that of the controller; with noise 1 u is a sigma further."""
     stored = a_policy(*LEARNERS["two commands"])
-    control = controller(stored, {})
+    control = make_controller(stored, {})
     c.write(control, tmp_path)
     (tmp_path / "sample.c").write_text(SAMPLE)
-    obs = observations(stored)[:50]
-    drawn = c.program(control, tmp_path / "sample.c")(obs)
+    obs = collect_observations(stored)[:50]
+    drawn = c.compile_example(control, tmp_path / "sample.c")(obs)
     np.testing.assert_allclose(drawn[:, 2:4], c.load(control, tmp_path)(obs), atol=1e-6)
     np.testing.assert_allclose(
         drawn[:, 4:6] - drawn[:, :2], np.exp(control.learner.log_std)[None] + np.zeros((50, 1)), atol=1e-5
@@ -229,8 +231,8 @@ def test_all_formats_of_a_run(run, command):
         "td on quadratic, seed 1, best policy (saved after 2 updates), 1 observations to 1 commands"
     )
     assert re.fullmatch(
-        r"tried +on 10,000 observations, \d,\d{3} of them played and the others drawn; "
-        r"errors in units of the largest command, against float64",
+        r"tested +on 10,000 observations, \d,\d{3} from episodes and the others random; "
+        r"errors relative to the largest command, against float64",
         tried,
     )
     assert [line.split()[0] for line in lines] == ["jax", *FORMATS]
@@ -262,8 +264,8 @@ def test_what_commands_something_else_is_not_written(bug, monkeypatch, tmp_path)
     monkeypatch.setitem(table, name, wrong)
     stored = a_policy(*POLICIES["two commands"])
     monkeypatch.setattr("jaxpg.store.policies.load", lambda *_: stored)
-    monkeypatch.setattr("jaxpg.deploy.export.origin", lambda *_: {"policy": "drawn"})
-    with pytest.raises(UserError, match=r"format=c: its commands differ from the formula's by .*; nothing is written"):
+    monkeypatch.setattr("jaxpg.deploy.exporter.describe_origin", lambda *_: {"policy": "drawn"})
+    with pytest.raises(UserError, match=r"format=c: the commands differ from the formula's by .*; nothing is written"):
         command_line.main(["run=somewhere", f"out={tmp_path / 'out'}"])
     assert not (tmp_path / "out").exists()
 
@@ -274,7 +276,7 @@ def test_mistakes_are_one_line(run, monkeypatch, tmp_path):
         (): "run=DIR is missing",
         ("run=nowhere",): "nowhere is not a run folder",
         (f"run={run}", "format=onx"): "format=onx: must be c or onnx or stablehlo or all",
-        (f"run={run}", f"out={tmp_path / 'file'}"): "there is a file of that name",
+        (f"run={run}", f"out={tmp_path / 'file'}"): "a file has that name",
         (f"run={run}", "agent=2"): "agent=2: the run has agents 0 to 1",
     }
     for arguments, message in mistakes.items():

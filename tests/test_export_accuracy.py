@@ -15,9 +15,9 @@ from envs.base import Interface, initial_state
 from jaxpg import export as command_line
 from jaxpg import normalization
 from jaxpg.config.schema import ACTIVATIONS, FEATURES
-from jaxpg.deploy import header, online, reference
-from jaxpg.deploy.controller import controller, observations, played
-from jaxpg.deploy.export import FORMATS, TOLERANCE, trial
+from jaxpg.deploy import c_learner, header, reference
+from jaxpg.deploy.controller import collect_observations, make_controller, play_observations
+from jaxpg.deploy.exporter import FORMATS, TOLERANCE, make_trial
 from jaxpg.errors import UserError
 from jaxpg.normalization import RunningStatistics
 
@@ -69,10 +69,10 @@ def test_the_reference_is_the_formula(features, activation):
     squash = (len(features) + len(activation)) % 2 == 0
     network = ("network.order=3", f"network.activation={activation}", f"network.squash={str(squash).lower()}")
     stored = a_policy("env=pendulum", "network.widths=[5,4]", f"network.features={features}", *network)
-    control = controller(stored, {})
+    control = make_controller(stored, {})
     obs = np.random.default_rng(0).normal(size=(5, control.observation_size)).astype(np.float32)
     expected = [looped_command(control, s) for s in obs]
-    np.testing.assert_allclose(reference.commands(control, obs), expected, rtol=0, atol=1e-12)
+    np.testing.assert_allclose(reference.compute_commands(control, obs), expected, rtol=0, atol=1e-12)
 
 
 # --- good controllers are written -------------------------------------------------------------------------------------
@@ -116,7 +116,7 @@ def export(monkeypatch, capsys, tmp_path):
 
     def run(stored, *arguments):
         monkeypatch.setattr("jaxpg.store.policies.load", lambda *_: stored)
-        monkeypatch.setattr("jaxpg.deploy.export.origin", lambda *_: {"policy": "drawn"})
+        monkeypatch.setattr("jaxpg.deploy.exporter.describe_origin", lambda *_: {"policy": "drawn"})
         command_line.main(["run=somewhere", f"out={tmp_path / 'out'}", *arguments])
         return capsys.readouterr().out
 
@@ -136,7 +136,7 @@ def test_slight_errors_are_seen_in_any_unit(limit, export, monkeypatch, tmp_path
     stored = changed(a_policy(*PENDULUM), limits=(limit,))
     slight = header.HEADER.replace("command[i] = {command};", "command[i] = {command} * (policy_real)1.0003;")
     monkeypatch.setattr(header, "HEADER", slight)
-    with pytest.raises(UserError, match=r"format=c: its commands differ from the formula's by .*e-04 of the limit"):
+    with pytest.raises(UserError, match=r"format=c: the commands differ from the formula's by .*e-04 of the limit"):
         export(stored)
     assert not (tmp_path / "out").exists()
 
@@ -147,18 +147,18 @@ def test_what_jax_gets_wrong_is_not_ours(export):
     def wrong(policy, obs):
         return stored.act(policy, obs) + 1e-3
 
-    with pytest.raises(UserError, match=r"^jax: its commands differ from the formula's by 1\.0e-03 of the limit"):
+    with pytest.raises(UserError, match=r"^jax: the commands differ from the formula's by 1\.0e-03 of the limit"):
         export(stored._replace(act=wrong))
 
 
 def test_units():
     stored = a_policy(*TWENTY)
-    control = controller(stored, {})
+    control = make_controller(stored, {})
     exact = np.tile(np.arange(20.0), (3, 1)) - 5
-    assert reference.units(control, exact)[0].tolist() == np.abs(np.arange(20.0) - 5).tolist()
-    assert reference.units(control._replace(squash=True), exact)[0].tolist() == [1.0] * 20
+    assert reference.error_units(control, exact)[0].tolist() == np.abs(np.arange(20.0) - 5).tolist()
+    assert reference.error_units(control._replace(squash=True), exact)[0].tolist() == [1.0] * 20
     limited = control._replace(interface=control.interface._replace(limits=tuple(range(20))))
-    assert reference.units(limited, exact)[0].tolist() == [*range(20)]
+    assert reference.error_units(limited, exact)[0].tolist() == [*range(20)]
     assert reference.largest_error(np.array([[0.0]]), np.array([[0.0]]), np.zeros(1)) == 0
     assert reference.largest_error(np.array([[1e-9]]), np.array([[0.0]]), np.zeros(1)) == np.inf
     assert np.isnan(reference.largest_error(np.array([[np.nan]]), np.array([[0.0]]), np.ones(1)))
@@ -167,7 +167,7 @@ def test_units():
 def test_an_ordinary_network_is_not_steep():
     for options in (PENDULUM, TWENTY, RELU):
         stored = a_policy(*options)
-        assert trial(controller(stored, {}), observations(stored)).tolerance < 5 * TOLERANCE
+        assert make_trial(make_controller(stored, {}), collect_observations(stored)).tolerance < 5 * TOLERANCE
 
 
 # --- what it is tried on ----------------------------------------------------------------------------------------------
@@ -193,10 +193,10 @@ def test_a_constant_observation_is_played(variance):
     interface = Interface(("constant", "count"), ("u",), None)
     stored = stored._replace(env=Counting(), interface=interface, policy=stored.policy._replace(normalizer=statistics))
     steps = np.repeat(np.arange(100.0), 50)
-    rows = observations(stored)
+    rows = collect_observations(stored)
     assert rows.shape == (10_000, 2)
     np.testing.assert_array_equal(rows[:5000], np.stack([np.full(5000, 1.5), steps], axis=1))
-    assert len(played(stored)) == 5000
+    assert len(play_observations(stored)) == 5000
     assert np.ptp(rows[5000:, 1]) > 100  # those are drawn
 
 
@@ -205,7 +205,7 @@ def test_observations_that_training_took_as_they_are_are_played_too():
     stored = a_policy("env=quadratic", "env.state_size=2", "algo.normalize_observations=false")
     interface = Interface(("constant", "count"), ("u",), None)
     policy = stored.policy._replace(normalizer=normalization.init(2))
-    rows = observations(stored._replace(env=Counting(), interface=interface, policy=policy))
+    rows = collect_observations(stored._replace(env=Counting(), interface=interface, policy=policy))
     np.testing.assert_array_equal(rows[:5000, 1], np.repeat(np.arange(100.0), 50))
     np.testing.assert_array_equal(rows[:, 0], 1.5)
     assert rows[5000:, 1].mean() == pytest.approx(49.5, abs=4)  # standard error 0.8
@@ -215,8 +215,8 @@ def test_what_is_tried_is_said(export):
     stored = a_policy(*PENDULUM)
     said = export(stored).splitlines()[1]
     assert said == (
-        f"tried      on 10,000 observations, {len(played(stored)):,} of them played and the others drawn; "
-        "errors in units of the limit, against float64"
+        f"tested     on 10,000 observations, {len(play_observations(stored)):,} from episodes and the others random; "
+        "errors relative to the limit, against float64"
     )
 
 
@@ -227,15 +227,15 @@ SLOWEST = ("algo.actor_lr=1e-14", "algo.critic_lr=1e-14")
 SLOW = ("algo.actor_lr=1e-4", "algo.critic_lr=1e-4")
 CALM = "network.sigma_is=fixed"
 TRIED = {  # share of the episodes that explode, and what is said; a sigma that is learned from them runs away
-    "some explode": (("env.share=0.5", CALM, *SLOW), r"differs from JAX by \d\.\de-0[5-9] at most, \d{3} updates"),
+    "some explode": (("env.share=0.5", CALM, *SLOW), r"differs from JAX by \d\.\de-0[5-9] at most in \d{3} updates"),
     "observations far from 0, as they are": (
         ("env.share=0", "env.unit=1e3", "algo.normalize_observations=false", CALM, *SLOWEST),
-        r"differs from JAX by \S+ at most, 1,000 updates",
+        r"differs from JAX by \S+ at most in 1,000 updates",
     ),
-    "all explode": (("env.share=1", CALM, *SLOW), "not tried: none of the episodes played would be learned from"),
+    "all explode": (("env.share=1", CALM, *SLOW), "not tested: no episode that was played can be learned from"),
     "it runs away": (
         ("env.share=0", *SLOW),
-        r"differs from JAX by \d\.\de-0[5-9] at most, \d{2,3} updates; in the \d{3} after these rounding may make more",
+        r"differs from JAX by \d\.\de-0[5-9] at most in \d{2,3} updates; rounding may add more in the other \d{3}",
     ),
 }
 
@@ -243,15 +243,16 @@ TRIED = {  # share of the episodes that explode, and what is said; a sigma that 
 @pytest.mark.parametrize("name", TRIED)
 def test_a_learner_is_tried_as_far_as_floats_tell(name, export, tmp_path):
     options, said = TRIED[name]
-    assert re.fullmatch(f" +in learning {said}", export(a_policy(*LEARNER, *options)).splitlines()[-1])
+    assert re.fullmatch(f" +learning {said}", export(a_policy(*LEARNER, *options)).splitlines()[-1])
     assert (tmp_path / "out" / "learn.c").exists()
 
 
 def test_a_learner_that_learns_something_else_is_not_written(export, monkeypatch, tmp_path):
     """Nor where the right one runs away."""
-    slight = online.CODE.replace("+= step_critic * z->value_bias", "+= (policy_real)1.01 * step_critic * z->value_bias")
-    assert slight != online.CODE
-    monkeypatch.setattr(online, "CODE", slight)
-    with pytest.raises(UserError, match=r"format=c: its learner's parameters differ from JAX's by .* after update \d"):
+    line = "+= step_critic * z->value_bias"
+    slight = c_learner.CODE.replace(line, line.replace("step_critic", "(policy_real)1.01 * step_critic"))
+    assert slight != c_learner.CODE
+    monkeypatch.setattr(c_learner, "CODE", slight)
+    with pytest.raises(UserError, match=r"format=c: the learner's parameters differ from JAX's by .* after update \d"):
         export(a_policy(*LEARNER, *SLOW, "env.share=0"))
     assert not (tmp_path / "out").exists()

@@ -14,9 +14,9 @@ from stored import a_policy
 from envs.base import Interface
 from jaxpg import export as command_line
 from jaxpg.deploy import c
-from jaxpg.deploy.controller import controller
-from jaxpg.deploy.names import LONGEST, identifier
-from jaxpg.deploy.sealing import NO_SEAL, is_sealed, sealed
+from jaxpg.deploy.controller import make_controller
+from jaxpg.deploy.identifiers import MAX_LENGTH, make_identifier
+from jaxpg.deploy.sealing import NO_SEAL, add_seal, is_sealed
 from jaxpg.errors import UserError
 
 OPTIONS = ("env=quadratic", "network.widths=[4]", "network=mlp")
@@ -27,7 +27,7 @@ def export(monkeypatch):
     """`export(*arguments)`: the command, of a policy that is drawn."""
     stored = a_policy(*OPTIONS)
     monkeypatch.setattr("jaxpg.store.policies.load", lambda *_: stored)
-    monkeypatch.setattr("jaxpg.deploy.export.origin", lambda *_: {"policy": "drawn"})
+    monkeypatch.setattr("jaxpg.deploy.exporter.describe_origin", lambda *_: {"policy": "drawn"})
     monkeypatch.setattr("jaxpg.deploy.controller.NUM_OBSERVATIONS", 200)
     return lambda *arguments: command_line.main(["run=somewhere", *arguments])
 
@@ -43,7 +43,7 @@ FILES = {
 def test_the_users_files_stay(form, export, tmp_path):
     for name in FILES[form]:
         (tmp_path / name).write_text("mine")
-        with pytest.raises(UserError, match=rf"holds {name}, not written by an export, or changed since: nothing is"):
+        with pytest.raises(UserError, match=rf"holds {name}, not written by an export or changed since: nothing is"):
             export(f"format={form}", f"out={tmp_path}")
         assert [(path.name, path.read_text()) for path in tmp_path.iterdir()] == [(name, "mine")]
         (tmp_path / name).unlink()
@@ -59,7 +59,7 @@ def test_what_an_export_has_written_is_replaced_until_it_is_changed(form, export
     content = bytearray(changed.read_bytes())
     content[-3] ^= 1
     changed.write_bytes(content)
-    with pytest.raises(UserError, match=f"holds {changed.name}, .*; take another out=DIR, or overwrite=true"):
+    with pytest.raises(UserError, match=f"holds {changed.name}, .*; choose another out=DIR, or overwrite=true"):
         export(f"format={form}", f"out={tmp_path}")
     assert changed.read_bytes() == content
     export(f"format={form}", f"out={tmp_path}", "overwrite=true")
@@ -68,7 +68,7 @@ def test_what_an_export_has_written_is_replaced_until_it_is_changed(form, export
 
 @given(st.binary(max_size=50), st.binary(max_size=50), st.integers(0), st.integers(1, 255))
 def test_a_seal_breaks_with_any_byte(before, after, place, change):
-    content = bytearray(sealed(before + NO_SEAL.encode() + after))
+    content = bytearray(add_seal(before + NO_SEAL.encode() + after))
     assert is_sealed(content)
     content[place % len(content)] ^= change
     assert not is_sealed(content)
@@ -119,7 +119,7 @@ def test_a_folder_that_cannot_be_written_is_one_line(export, tmp_path):
 
 def test_a_folder_in_a_files_place_is_one_line(export, tmp_path):
     (tmp_path / "main.c").mkdir()
-    with pytest.raises(UserError, match=r"main\.c there is a folder"):
+    with pytest.raises(UserError, match=r"main\.c is a folder there"):
         export(f"out={tmp_path}", "overwrite=true")
     assert [path.name for path in tmp_path.iterdir()] == ["main.c"]
 
@@ -133,10 +133,10 @@ NAMES += ["myPOLICY", "policy", "main", "a" * 300, 'x"y', "a\nb", "stdio.h", "Na
 def a_controller(name=None, observations=("x",), commands=("u",), number=1.0):
     stored = a_policy(*OPTIONS)
     interface = Interface(tuple(observations), tuple(commands), (2.0,))
-    control = controller(stored._replace(interface=interface), {"policy": "drawn", "run": observations[0]})
+    control = make_controller(stored._replace(interface=interface), {"policy": "drawn", "run": observations[0]})
     *layers, last = control.layers
     control = control._replace(layers=[*layers, last._replace(bias=np.array([number], np.float32))])
-    return control if name is None else control._replace(name=identifier(name))
+    return control if name is None else control._replace(name=make_identifier(name))
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -144,7 +144,7 @@ def test_any_name_of_an_environment_compiles(name, tmp_path):
     control = a_controller(name)
     paths = c.write(control, tmp_path)
     assert c.load(control, tmp_path)(np.zeros((3, 1))).shape == (3, 1)
-    assert all(len(path.name) <= LONGEST + 20 and path.name.isascii() for path in paths)
+    assert all(len(path.name) <= MAX_LENGTH + 20 and path.name.isascii() for path in paths)
     compiled_as_cpp(tmp_path, f'#include "{paths[0].name}"\nint main() {{ return 0; }}\n')
 
 
@@ -156,11 +156,11 @@ def compiled_as_cpp(folder, text):
 
 @given(st.text())
 def test_an_identifier_is_one(name):
-    word = identifier(name)
+    word = make_identifier(name)
     assert word.isidentifier()
     assert word.isascii()
     assert not word.startswith("_")
-    assert identifier(word) == word
+    assert make_identifier(word) == word
 
 
 NASTY = ["*/ int x = 1; /*", "ends in a backslash\\", "ends in a trigraph??/", "two\nlines", "// comment", "/*"]
@@ -205,7 +205,7 @@ def test_two_controllers_in_one_program(tmp_path):
     for control in controls:
         c.write(control, tmp_path)
     (tmp_path / "both.c").write_text(BOTH)
-    found = c.program(controls[0], tmp_path / "both.c")(np.zeros((0, 1)))
+    found = c.compile_example(controls[0], tmp_path / "both.c")(np.zeros((0, 1)))
     expected = [c.load(control, tmp_path)(np.zeros((1, 1)))[0, 0] for control in reversed(controls)]
     np.testing.assert_allclose(found[0, 1], expected[0])
     assert found[0, 0] != found[0, 1]
@@ -218,10 +218,10 @@ def test_two_of_one_name_are_an_error(other, tmp_path):
         c.write(a_controller(name, number=number), tmp_path / str(number))
     same = '#include "0/arm.h"\n#include "0/arm.h"\nint main(void) { return 0; }\n'
     (tmp_path / "same.c").write_text(same)
-    c.program(a_controller("arm"), tmp_path / "same.c")
+    c.compile_example(a_controller("arm"), tmp_path / "same.c")
     (tmp_path / "two.c").write_text(same.replace('0/arm.h"\nint', f'1/{other}.h"\nint'))
     with pytest.raises(RuntimeError, match=r"two controllers are called .* here: export one of them with name="):
-        c.program(a_controller("arm"), tmp_path / "two.c")
+        c.compile_example(a_controller("arm"), tmp_path / "two.c")
 
 
 def test_a_name_of_ones_own(export, tmp_path):
@@ -230,7 +230,7 @@ def test_a_name_of_ones_own(export, tmp_path):
     assert {path.name for path in tmp_path.iterdir()} == ours
     assert "left_arm_command" in (tmp_path / "main.c").read_text()
     for name in ("2arms", "left-arm", "math"):
-        with pytest.raises(UserError, match=rf"name={name}: C .* name=\w+ is possible"):
+        with pytest.raises(UserError, match=rf"name={name}: not a prefix for C .* try name=\w+"):
             export(f"name={name}", f"out={tmp_path}")
 
 
@@ -238,7 +238,7 @@ def test_a_name_of_ones_own(export, tmp_path):
 def test_limits_of_any_sequence(limits, tmp_path):
     stored = a_policy(*OPTIONS)
     for names in itertools.chain([("x",)], [["x"]]):
-        control = controller(stored._replace(interface=Interface(names, names, limits)), {})
+        control = make_controller(stored._replace(interface=Interface(names, names, limits)), {})
         text = c.write(control, tmp_path)[0].read_text()
         assert "command[0]: x, at most 2 either way" in text
 
@@ -246,19 +246,19 @@ def test_limits_of_any_sequence(limits, tmp_path):
 @pytest.mark.parametrize(
     ("interface", "message"),
     [
-        (Interface(("x", "y"), ("u",), (1.0,)), r"interface\.observations has 2 entries, and must have 1"),
+        (Interface(("x", "y"), ("u",), (1.0,)), r"interface\.observations has 2 entries, expected 1"),
         (Interface(("x",), (), (1.0,)), r"interface\.commands has 0 entries"),
         (Interface(("x",), ("u",), (1.0, 2.0)), r"interface\.limits has 2 entries"),
-        (Interface(("x",), ("u",), (np.nan,)), "in its limits are numbers that are not finite"),
+        (Interface(("x",), ("u",), (np.nan,)), "its limits contain numbers that are not finite"),
     ],
 )
 def test_an_interface_that_does_not_fit_is_one_line(interface, message):
     with pytest.raises(UserError, match=message):
-        controller(a_policy(*OPTIONS)._replace(interface=interface), {})
+        make_controller(a_policy(*OPTIONS)._replace(interface=interface), {})
 
 
 def test_a_policy_of_nan_is_one_line():
     stored = a_policy(*OPTIONS)
     normalizer = stored.policy.normalizer._replace(mean=np.array([np.nan], np.float32))
-    with pytest.raises(UserError, match="in its observation statistics are numbers that are not finite"):
-        controller(stored._replace(policy=stored.policy._replace(normalizer=normalizer)), {})
+    with pytest.raises(UserError, match="its observation statistics contain numbers that are not finite"):
+        make_controller(stored._replace(policy=stored.policy._replace(normalizer=normalizer)), {})

@@ -12,7 +12,7 @@ from jaxpg.store.checkpoint import Checkpoints, SaveError
 from jaxpg.store.folder import RunFolder, read_metrics
 from jaxpg.store.metrics_log import MetricsLog
 
-SAVE_FAILED = "training goes on, and saving is tried again at each line of metrics"
+SAVE_FAILED = "training continues, and saving is tried again at each line of metrics"
 LOST = "could not be saved; resume="
 
 
@@ -44,14 +44,14 @@ def test_a_full_disk_that_is_emptied_leaves_no_trace(command_environment, disk, 
         stop_after(process, folder, 15)
         fill(disk)
         proceed(process)
-        said = output_until(process, SAVE_FAILED, "lines wait until it can")
+        said = output_until(process, SAVE_FAILED, "lines are kept until it can")
         stop_after(process, folder, 15)
         (disk / "ballast").unlink()
         proceed(process)
         said += process.stdout.read()
         assert process.wait() == 0, said
     assert said.count("No space left on device") == said.count("note: ") - 1
-    assert said.count(SAVE_FAILED) == said.count("note: saved again, after ") == 1
+    assert said.count(SAVE_FAILED) == said.count("note: saving works again, after ") == 1
     assert "Traceback" not in said
     assert outcome(folder) == undisturbed
 
@@ -66,7 +66,7 @@ def test_a_disk_that_stays_full_is_status_5(command, command_environment, disk, 
         said = process.stdout.read()
         assert process.wait() == 5, said
     assert said.count(SAVE_FAILED) == said.count(LOST) == 1
-    assert said.endswith(f"error: the last state, at {16 * LINES:,} steps, {LOST}{folder} repeats what is lost\n")
+    assert said.endswith(f"error: the last state, at {16 * LINES:,} steps, {LOST}{folder} repeats the lost updates\n")
     assert "Traceback" not in said
     (disk / "ballast").unlink()
     found = json.loads(command("inspect", f"run={folder}", "json=true").stdout)
@@ -117,7 +117,7 @@ def test_there_is_no_checkpoint_without_its_lines_of_metrics(command, command_en
         proceed(process)
         said = process.stdout.read()
         assert process.wait() == 5, said
-    assert said.count("not written without its lines of metrics, which cannot be (No such file or directory)") == 1
+    assert said.count("not written, as its lines of metrics cannot be (No such file or directory)") == 1
     (folder / "moved").rename(folder / "metrics.jsonl")
     assert command("train", f"resume={folder}").returncode == 0
     assert outcome(folder) == undisturbed

@@ -27,7 +27,7 @@ def test_the_colours_are_those_of_the_page():
 
 
 def test_the_deterministic_policy_has_the_first_colour_as_on_the_page(drawn):
-    figures.learning_curve(LINES, io.BytesIO(), "a run")
+    figures.draw_learning_curve(LINES, io.BytesIO(), "a run")
     curves = {line.get_label().split(":")[0]: line.get_color() for line in drawn[0].axes[0].get_lines()}
     assert list(curves) == ["deterministic policy", "while training"]
     assert list(curves.values()) == list(figures.COLORS[:2])
@@ -37,7 +37,7 @@ def test_the_deterministic_policy_has_the_first_colour_as_on_the_page(drawn):
 def test_the_legend_says_what_the_band_is(drawn, seeds, words):
     values = np.random.default_rng(0).normal(size=(3, seeds))
     lines = [{"steps": i, "eval_return": row.tolist()} for i, row in enumerate(values)]
-    figures.learning_curve(lines, io.BytesIO(), "a run")
+    figures.draw_learning_curve(lines, io.BytesIO(), "a run")
     axes = drawn[0].axes[0]
     assert axes.get_lines()[0].get_label().endswith(f"interquartile mean of {seeds} seeds, {words}")
     band = axes.collections[0].get_paths()[0].vertices

@@ -151,7 +151,7 @@ def test_keyword_arguments_are_the_environments_options():
     [
         ({"mas": 2.0}, "unknown option 'mas': did you mean 'mass'?"),
         ({"mass": -1.0}, "mass=-1.0: must be above 0"),
-        ({"episode_length": 50}, "episode_length: the time limit is called max_episode_steps in Gymnasium"),
+        ({"episode_length": 50}, "episode_length: Gymnasium calls the time limit max_episode_steps"),
     ],
 )
 @pytest.mark.parametrize("make", [gymnasium.make, gymnasium.make_vec])
@@ -162,7 +162,7 @@ def test_mistakes_in_the_options_are_named(make, options, message):
 
 
 def test_a_render_mode_is_refused_with_a_type_error():
-    with pytest.raises(TypeError, match="draw nothing"):
+    with pytest.raises(TypeError, match="cannot render"):
         gymnasium.make(PENDULUM, render_mode="rgb_array")
 
 
@@ -229,7 +229,7 @@ def test_misuse_is_named():
     batch = gymnasium.make_vec(PENDULUM, num_envs=2)
     with pytest.raises(gymnasium.error.ResetNeeded):
         batch.step(np.zeros((2, 1)))
-    with pytest.raises(ValueError, match="3 seeds for 2 environments"):
+    with pytest.raises(ValueError, match="expected 2 seeds, one for each environment, not 3"):
         batch.reset(seed=[1, 2, 3])
     batch.reset(seed=[1, None])
     with pytest.raises(ValueError, match="shape"):

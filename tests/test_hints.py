@@ -9,7 +9,7 @@ import pytest
 
 from envs import hints, playground_env
 from envs.options import OptionError
-from jaxpg.deploy.export import FORMATS
+from jaxpg.deploy.exporter import FORMATS
 from jaxpg.errors import UserError
 from jaxpg.store.loggers import follower
 from jaxpg.watch import episodes, movie
@@ -40,7 +40,7 @@ def interpreter(monkeypatch, tmp_path):
 )
 def test_the_interpreter_as_the_shell_finds_it(interpreter, path, typed):
     interpreter(path)
-    assert hints.python() == typed
+    assert hints.python_command() == typed
     assert subprocess.run(f"{typed} -c 'print(7)'", shell=True, capture_output=True, check=True).stdout == b"7\n"
 
 
@@ -74,12 +74,12 @@ def without_flatbuffers(monkeypatch):
 
 def without_a_logger(monkeypatch):
     monkeypatch.setattr(follower, "_is_installed", lambda package: False)
-    follower.check(["wandb"])
+    follower.check_installed(["wandb"])
 
 
 def without_av(monkeypatch):
     monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
-    movie.chosen(Path("video.mp4"))
+    movie.find_format(Path("video.mp4"))
 
 
 def without_playground(monkeypatch):

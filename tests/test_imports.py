@@ -137,7 +137,7 @@ def test_help_loads_nothing_heavy():
 
 
 def test_a_stored_policy_is_read_without_what_trained_it():
-    loaded = loaded_by("import jaxpg.deploy.policy, jaxpg.store.policies, jaxpg.store.checkpoint")
+    loaded = loaded_by("import jaxpg.deploy.python_policy, jaxpg.store.policies, jaxpg.store.checkpoint")
     training = {"losses", "estimators", "baselines", "batch", "updates", "actor_critic", "ppo", "online", "shards"}
     assert not loaded & {f"jaxpg.{name}" for name in training}
     assert not loaded & {"jaxpg.program.compile", "jaxpg.program.algorithms", "optax"}
@@ -150,4 +150,4 @@ def test_nothing_is_imported_before_it_is_needed():
 
 
 def test_what_is_imported_while_xla_compiles_is_there():
-    assert "matplotlib.figure" in loaded_by("from jaxpg.run import session; session._import_the_rest()")
+    assert "matplotlib.figure" in loaded_by("from jaxpg.run import session; session._import_late_modules()")

@@ -44,7 +44,7 @@ def test_a_finished_run(runs, command):
     text = command("inspect", f"run={runs / 'run'}").stdout
     for words in ("td on quadratic, seed 0", "96 of 96 steps, finished", "12 sound, 8 sound, 4 sound", found["digest"]):
         assert words in text
-    assert "as they are now" in text
+    assert "unchanged" in text
 
 
 def test_other_versions_are_named(runs, command, tmp_path):
@@ -64,7 +64,7 @@ def test_versions_that_computed_a_part_of_a_run_stay_on_record(runs, command, tm
     result = command("train", f"resume={folder}", "total_steps=128")
     assert f"note: jax was 0.0.1 and is {now['jax']}: the same run, but not the same bits" in result.stdout
     assert json.loads(path.read_text()) == now | {"earlier": [now | {"jax": "0.0.1"}]}
-    assert "as they are now; 1 others before (versions.json)" in command("inspect", f"run={folder}").stdout
+    assert "unchanged; 1 others before (versions.json)" in command("inspect", f"run={folder}").stdout
     result = command("train", f"resume={folder}", "total_steps=160")
     assert "not the same bits" not in result.stdout
     path.write_text(json.dumps(json.loads(path.read_text()) | {"jax": "0.0.2"}))
@@ -83,7 +83,7 @@ def test_a_damaged_checkpoint_is_named_and_the_one_before_it_used(runs, command,
     result = command("train", f"resume={folder}")
     assert result.returncode == 0, result.stderr
     assert "checkpoints/12: " in result.stdout
-    assert "the one before it is used" in result.stdout
+    assert "using the one before it" in result.stdout
     assert inspected(command, folder) == inspected(command, runs / "run")
 
 

@@ -10,8 +10,8 @@ from stored import a_policy
 
 from jaxpg.config.schema import ACTIVATIONS, FEATURES
 from jaxpg.deploy import c
-from jaxpg.deploy.controller import commanding, controller
-from jaxpg.deploy.export import FORMATS
+from jaxpg.deploy.controller import make_command, make_controller
+from jaxpg.deploy.exporter import FORMATS
 from jaxpg.normalization import RunningStatistics
 
 INVALID = (np.nan, np.inf, -np.inf, 1e30, -3e38)
@@ -59,7 +59,7 @@ def written(tmp_path_factory):
     def make(name):
         if name not in made:
             stored, folder = a_stored(*CONFIGURATIONS[name]), tmp_path_factory.mktemp("written")
-            control, command = controller(stored, {}), commanding(stored)
+            control, command = make_controller(stored, {}), make_command(stored)
             forms = {"jax": jax.jit(command)}
             for form, way in FORMATS.items():
                 way.write(control, folder, command)
@@ -115,15 +115,15 @@ OPTIMIZATIONS = {"as usual": (), "fast": ("-O3", "-ffast-math"), "none": ("-O0",
 def test_c_says_so_with_any_flags(name, flags, tmp_path, monkeypatch):
     """-ffast-math lets a compiler take for granted that no number is NaN."""
     stored = a_stored(*CONFIGURATIONS[name])
-    control = controller(stored, {})
+    control = make_controller(stored, {})
     c.write(control, tmp_path)
     (tmp_path / "flagged.c").write_text(FLAGGED)
     monkeypatch.setattr(c, "FLAGS", (*c.FLAGS, *OPTIMIZATIONS[flags]))
-    run = c.program(control, tmp_path / "flagged.c")
+    run = c.compile_example(control, tmp_path / "flagged.c")
     np.testing.assert_array_equal(run(invalid_rows(stored)), np.zeros((len(invalid_rows(stored)), 2)))
     found = run(valid_rows(stored))
     assert (found[:, 0] == 1).all()
-    np.testing.assert_allclose(found[:, 1:], commanding(stored)(valid_rows(stored)), rtol=0, atol=2e-5)
+    np.testing.assert_allclose(found[:, 1:], make_command(stored)(valid_rows(stored)), rtol=0, atol=2e-5)
 
 
 def test_a_constant_of_training_must_be_a_number_too(tmp_path):
@@ -134,7 +134,7 @@ def test_a_constant_of_training_must_be_a_number_too(tmp_path):
     stored = stored._replace(policy=stored.policy._replace(normalizer=normalizer))
     rows = np.tile(np.asarray(mean), (3, 1))
     rows[:, 0] = [mean[0], np.nan, np.inf]
-    control, command = controller(stored, {}), commanding(stored)
+    control, command = make_controller(stored, {}), make_command(stored)
     for form, way in FORMATS.items():
         way.write(control, tmp_path, command)
         for found in (way.load(control, tmp_path)(rows), command(rows)):
@@ -151,7 +151,7 @@ def test_an_action_that_is_not_finite_commands_zero(tmp_path):
     rows = valid_rows(stored)
     with jax.debug_nans(False):
         raw = stored.act(policy, rows)
-    control, command = controller(stored, {}), commanding(stored)
+    control, command = make_controller(stored, {}), make_command(stored)
     zero = np.isnan(np.asarray(raw))
     assert zero.any()
     for form, way in FORMATS.items():
@@ -176,12 +176,12 @@ STEPS = {  # what of a step is bad, and whether nothing is learned
 def test_nothing_is_learned_from_it(name, tmp_path):
     """The parameters stay as they were, and are learned again from the next step on."""
     place, bad, terminated, nothing = STEPS[name]
-    control = controller(a_policy(*ONLINE, "algo.actor_lr=1e-3", "algo.critic_lr=1e-3"), {})
+    control = make_controller(a_policy(*ONLINE, "algo.actor_lr=1e-3", "algo.critic_lr=1e-3"), {})
     c.write(control, tmp_path)
     steps = np.random.default_rng(0).normal(size=(5, 3 + 1 + 1 + 3 + 2))
     steps[:, -2:] = 0
     steps[2, place], steps[2, -2] = bad, terminated
-    found = c.program(control, tmp_path / "learn.c")(steps)
+    found = c.compile_example(control, tmp_path / "learn.c")(steps)
     assert np.isfinite(found).all()
     moved = np.abs(np.diff(found, axis=0)).max(axis=1)
     assert (moved[[0, 2, 3]] > 0).all()
@@ -206,9 +206,9 @@ int main(void) {
 
 def test_a_sample_of_the_learner_is_zero_too(tmp_path):
     stored = a_policy(*ONLINE)
-    control = controller(stored, {})
+    control = make_controller(stored, {})
     c.write(control, tmp_path)
     (tmp_path / "sampled.c").write_text(SAMPLED)
-    run = c.program(control, tmp_path / "sampled.c")
+    run = c.compile_example(control, tmp_path / "sampled.c")
     np.testing.assert_array_equal(run(invalid_rows(stored)), np.zeros((len(invalid_rows(stored)), 2)))
     assert (run(valid_rows(stored)[:20]) != 0).all()

@@ -16,7 +16,7 @@ from jaxpg import train
 from jaxpg.errors import UserError
 from jaxpg.store import folder
 from jaxpg.store.folder import RunFolder
-from jaxpg.store.loggers import LoggerError, UntilItFails, follower, sender, values_of
+from jaxpg.store.loggers import LoggerError, SafeLogger, follower, mean_values, sender
 from jaxpg.store.metrics_log import MetricsLog
 
 # A stand-in for wandb that writes down what it is given, in a process of its own as the real one.
@@ -131,12 +131,12 @@ def test_tensorboard_has_every_step_once_whatever_the_clock_says(run_folder, mon
 
 def test_values_are_means_over_the_agents_that_have_one():
     line = {"update": 1, "steps": 8, "return": [1.0, None, 4.0], "eval_return": None, "value": [None, None], "sigma": 2}
-    assert values_of(line) == {"return": 2.5, "sigma": 2}
+    assert mean_values(line) == {"return": 2.5, "sigma": 2}
 
 
 def test_a_logger_that_fails_says_so_once_and_gets_nothing_more():
     notes, memory = [], Memory(fails_at=16)
-    logger = UntilItFails(lambda: memory, "memory", notes.append)
+    logger = SafeLogger(lambda: memory, "memory", notes.append)
     for step in (8, 16, 24):
         logger.write({"return": 1.0}, step)
     logger.close()
@@ -152,7 +152,7 @@ def test_a_logger_that_cannot_begin_or_end_stops_nothing(begins):
         return Memory(fails_at="close")
 
     notes = []
-    logger = UntilItFails(begin, "memory", notes.append)
+    logger = SafeLogger(begin, "memory", notes.append)
     logger.write({"return": 1.0}, 8)
     logger.close()
     assert notes == ["note: memory: cannot be written (No space left on device); it gets no more metrics"]
@@ -199,7 +199,7 @@ def test_a_service_gets_the_configuration_the_name_and_every_line(run_folder, st
     log_lines(run_folder, [1, 2, 3])
     (init, _, name, config), *logged = stand_in()
     assert (init, name, config) == ("init", "run", {"seed": 3, "env": {"id": "pendulum", "mass": 1e-3}})
-    written = [(line["steps"], values_of(line)) for line in folder.read_metrics(run_folder)]
+    written = [(line["steps"], mean_values(line)) for line in folder.read_metrics(run_folder)]
     assert [(step, values) for _, step, values in logged] == written
     assert len(written) == 3
     assert capfd.readouterr() == ("", ""), "what a service prints is for its log"
@@ -246,12 +246,14 @@ def test_a_service_that_refuses_costs_one_note(run_folder, stand_in, monkeypatch
 def test_a_service_that_hangs_holds_nothing_up(run_folder, stand_in, monkeypatch):
     """More words than the pipe takes do not block, and the end waits no longer than it is allowed to."""
     monkeypatch.setenv("STAND_IN_HANGS", "1")
-    monkeypatch.setattr(follower, "CLOSING", 0.1)
+    monkeypatch.setattr(follower, "CLOSE_TIMEOUT", 0.1)
     service = follower.Follower("wandb", run_folder.loggers)
     run_folder.metrics.touch()
     for step in range(1 << 17):
         service.write({}, step)
-    with pytest.raises(LoggerError, match=r"^has not got all metrics after 0 s; process \d+ goes on with it for 10 "):
+    with pytest.raises(
+        LoggerError, match=r"^has not received all metrics after 0 s; process \d+ continues for at most 10 "
+    ):
         service.close()
     service._process.kill()
     service._process.wait()
@@ -273,10 +275,10 @@ def test_a_store_on_this_machine_needs_a_database(monkeypatch, uri):
     monkeypatch.setenv("MLFLOW_TRACKING_URI", uri)
     monkeypatch.setattr(follower, "_is_installed", lambda package: package == "mlflow")
     if uri:
-        follower.check(["mlflow"])
+        follower.check_installed(["mlflow"])
     else:
         with pytest.raises(UserError, match=r"^loggers=\[mlflow\]: \S+ -m pip install mlflow$"):
-            follower.check(["mlflow"])
+            follower.check_installed(["mlflow"])
 
 
 def test_the_process_of_a_logger_is_a_light_one():

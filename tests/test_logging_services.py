@@ -14,7 +14,7 @@ from processes import LINES, RUN, has_written, stop_after, training
 
 from jaxpg.store import folder
 from jaxpg.store.folder import RunFolder
-from jaxpg.store.loggers import follower, values_of
+from jaxpg.store.loggers import follower, mean_values
 from jaxpg.store.metrics_log import MetricsLog
 
 
@@ -55,13 +55,13 @@ def wait_for_senders(run_folder):
 
 def expected(lines):
     """What services have of the lines; the seconds of repeated ones are those of the first time."""
-    return [(line["steps"], {k: v for k, v in values_of(line).items() if k != "seconds"}) for line in lines]
+    return [(line["steps"], {k: v for k, v in mean_values(line).items() if k != "seconds"}) for line in lines]
 
 
 def test_services_make_no_noise(interrupted):
     *_, (out, error) = interrupted
     assert error == ""
-    said = [line.lower() for line in out.splitlines() if "goes on with it" not in line]
+    said = [line.lower() for line in out.splitlines() if "continues for at most" not in line]
     assert not any(word in line for line in said for word in ("wandb", "mlflow", "note"))
 
 
@@ -146,7 +146,7 @@ def test_mlflow_has_a_database_of_its_own_where_none_is_named(tmp_path, monkeypa
     mlflow = pytest.importorskip("mlflow")
     pytest.importorskip("alembic")
     monkeypatch.delenv("MLFLOW_TRACKING_URI", raising=False)
-    monkeypatch.setattr(follower, "CLOSING", 120.0)
+    monkeypatch.setattr(follower, "CLOSE_TIMEOUT", 120.0)
     run_folder = RunFolder(tmp_path / "run")
     run_folder.path.mkdir()
     run_folder.config.write_text("seed: 3\n")

@@ -92,7 +92,7 @@ def test_every_update_of_a_learner_is_the_hosts(name, tmp_path):
     steps = drawn(40, 3 + 2 + 1 + 3 + 2)
     steps[:, -2:] = steps[:, -2:] > 1.5  # ends of both kinds
     assert steps[:, -2:].any(axis=0).all()
-    host = c.program(control, tmp_path / "learn.c")(steps)
+    host = c.compile_example(control, tmp_path / "learn.c")(steps)
     assert np.abs(host[-1] - host[0]).max() > 1e-2
     outcome = tried(CORES[name], LEARNER, steps, host.shape[1], tmp_path)
     np.testing.assert_allclose(outcome.numbers, host, rtol=0, atol=2e-6)

@@ -16,30 +16,30 @@ from envs.base import Interface, initial_state
 from envs.options import option
 from jaxpg import evaluate, train
 from jaxpg.store import policies
-from jaxpg.store.names import OURS, numbered, own_interface, own_metrics
-from jaxpg.watch.clips import clip
+from jaxpg.store.names import RESERVED, number_duplicates, rename_interface, rename_metrics
+from jaxpg.watch.clips import make_clip
 from jaxpg.watch.recording import record
 
-NAMES = st.lists(st.one_of(st.sampled_from(sorted(OURS)), st.text(max_size=150), st.just("env_return")), max_size=8)
+NAMES = st.lists(st.one_of(st.sampled_from(sorted(RESERVED)), st.text(max_size=150), st.just("env_return")), max_size=8)
 
 
 @given(st.lists(st.sampled_from(["a", "a (2)", "a (2) (2)", "b", ""]), max_size=8))
 def test_numbered_names_are_distinct_and_stay_where_they_were_before(names):
-    found = numbered(names, taken=["b"])
+    found = number_duplicates(names, taken=["b"])
     assert len({*found, "b"}) == len(names) + 1
     for i, (name, new) in enumerate(zip(names, found, strict=True), start=1):
         assert new in (name, f"{name} ({i})")
     if len({*names, "b"}) == len(names) + 1:
         assert found == names
-    assert numbered(found, taken=["b"]) == found
+    assert number_duplicates(found, taken=["b"]) == found
 
 
 @given(NAMES)
 def test_metrics_keep_their_values_under_names_that_are_nobody_elses(names):
     metrics = {name: i for i, name in enumerate(names)}
-    found = own_metrics(metrics)
+    found = rename_metrics(metrics)
     assert list(found.values()) == list(metrics.values())
-    assert not OURS & set(found)
+    assert not RESERVED & set(found)
     json.dumps(found).encode("ascii")
     for name in found:
         name.encode()
@@ -50,11 +50,11 @@ def test_metrics_keep_their_values_under_names_that_are_nobody_elses(names):
 
 @pytest.mark.parametrize("name", ["success", "distance", "reward/alive", "Höhe", "x.y-z", "swing up"])
 def test_usual_names_stay(name):
-    assert list(own_metrics({name: 1})) == [name]
+    assert list(rename_metrics({name: 1})) == [name]
 
 
 def test_names_of_an_interface_are_told_apart():
-    found = own_interface(Interface(("x", "x", ""), ("torque [N m]", "torque [N m]", "value"), (1.0, 2.0, 3.0)))
+    found = rename_interface(Interface(("x", "x", ""), ("torque [N m]", "torque [N m]", "value"), (1.0, 2.0, 3.0)))
     assert found.observations == ("x (1)", "x (2)", "observation_2")
     assert found.commands == ("torque [N m] (1)", "torque [N m] (2)", "value (3)")
     assert found.limits == (1.0, 2.0, 3.0)
@@ -120,7 +120,7 @@ def test_the_evaluation_shows_both(run, capsys):
 def test_commands_with_one_name_are_a_series_each(run):
     stored = policies.load(str(run))
     (recording,) = record(stored, [stored.policy], jax.random.split(jax.random.key(0), 2))
-    series = clip(stored, recording, 0).series
+    series = make_clip(stored, recording, 0).series
     assert list(series) == ["torque (1)", "torque (2)", "reward (3)", "reward", "value"]
     for i, name in enumerate(["torque (1)", "torque (2)", "reward (3)"]):
         np.testing.assert_array_equal(series[name], recording.command[:4, 0, i])

@@ -16,7 +16,7 @@ from jaxpg.program.algorithms import make_algorithm
 from jaxpg.program.compile import NAN_POLICIES
 from jaxpg.program.environment import make_env
 from jaxpg.rollout import rollout
-from jaxpg.run.chunks import Watch, summary
+from jaxpg.run.chunks import NonFiniteMonitor, summarize
 from jaxpg.training import train_scan
 from jaxpg.types import Algorithm, TrainState
 from jaxpg.vector_env import vectorize
@@ -87,11 +87,11 @@ def test_skip_learns_nothing_from_the_update_and_goes_on(what):
 def test_what_exploded_is_named_as_it_is(what):
     """The place that the program counts is found again among the metrics' names."""
     state, metrics = train_scan(stop_at_nonfinite(exploding(what, jnp.nan)), KEY, 5)
-    watch = Watch(compose([]), print)
-    watch.look(state._replace(update=np.zeros(1, int)), {name: np.asarray(x)[None] for name, x in metrics.items()})
+    monitor = NonFiniteMonitor(compose([]), print)
+    monitor.observe(state._replace(update=np.zeros(1, int)), {name: np.asarray(x)[None] for name, x in metrics.items()})
     where = " of environment 1" if what == "observation" else ""
-    assert watch.problem == f"update {BAD}: {what}{where} is not finite"
-    assert watch.nobody_goes_on, "it would make the same update again"
+    assert monitor.problem == f"update {BAD}: {what}{where} is not finite"
+    assert monitor.is_stuck, "it would make the same update again"
 
 
 @pytest.mark.parametrize(
@@ -200,7 +200,7 @@ METRICS = {
 
 
 def test_a_line_has_the_means_of_the_sound_updates():
-    line = summary({name: jnp.asarray(value) for name, value in METRICS.items()})
+    line = summarize({name: jnp.asarray(value) for name, value in METRICS.items()})
     assert line == {
         "return": [3.0, None],
         "episodes": [2.0, 0.0],
@@ -214,20 +214,20 @@ def test_a_line_has_the_means_of_the_sound_updates():
 def test_each_agent_is_named_once():
     config = compose(["num_seeds=2", "seed=7", "nan_policy=skip"])
     said = []
-    watch = Watch(config, said.append)
+    monitor = NonFiniteMonitor(config, said.append)
     state = TrainState(None, None, None, None, np.array([10, 10]))
     metrics = {name: np.asarray(value) for name, value in METRICS.items()}
     for _ in range(2):
-        watch.look(state, metrics)
+        monitor.observe(state, metrics)
     names = quantities(METRICS)
     assert said == [
-        f"note: update 12: {names[2]} is not finite, seed 7; such updates are left out",
-        f"note: update 11: {names[1]} is not finite, seed 8; such updates are left out",
+        f"note: update 12: {names[2]} is not finite, seed 7; such updates are skipped",
+        f"note: update 11: {names[1]} is not finite, seed 8; such updates are skipped",
         "note: update 13: the physics of environment 5, seed 7 diverged: a number is not finite or beyond 1e+10; its "
-        "episode ended there and is not learned from, and diverged in metrics.jsonl counts such",
+        "episode ends there and is not learned from; metrics.jsonl counts these as diverged",
     ]
-    assert watch.problem == f"update 12: {names[2]} is not finite, seed 7"
-    assert not watch.nobody_goes_on
+    assert monitor.problem == f"update 12: {names[2]} is not finite, seed 7"
+    assert not monitor.is_stuck
 
 
 # --- commands ---------------------------------------------------------------------------------------------------------
@@ -259,7 +259,7 @@ def test_with_skip_it_goes_on_from_there(exploded, command):
     assert again.returncode == 4, "the same update again"
     assert outcome(folder)[:2] == (before, update)
     result = command("train", f"resume={folder}", "nan_policy=skip")
-    assert "such updates are left out" in result.stdout
+    assert "such updates are skipped" in result.stdout
     assert result.returncode == 0, "some of the updates after it are finite"
     lines, number, _ = outcome(folder)
     assert number == 2 * LINES

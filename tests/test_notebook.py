@@ -24,7 +24,7 @@ def test_the_notebook_was_executed_from_top_to_bottom():
     assert {output["name"] for output in outputs if output["output_type"] == "stream"} == {"stdout"}
     assert sum("image/png" in output.get("data", {}) for output in outputs) == 2
     said = "".join("".join(output.get("text", "")) for output in outputs)
-    assert "in units of the limit, against float64" in said
+    assert "relative to the limit, against float64" in said
     assert "mujoco, as c" in said
 
 

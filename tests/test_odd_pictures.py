@@ -23,11 +23,11 @@ from jaxpg.normalization import RunningStatistics
 from jaxpg.program.networks import make_networks
 from jaxpg.program.state import Policy
 from jaxpg.store.folder import RunFolder
-from jaxpg.store.policies import stored_policy
-from jaxpg.watch import attempts, player, report
+from jaxpg.store.policies import make_stored_policy
+from jaxpg.watch import attempts, player, run_page
 from jaxpg.watch.attempts import NotDrawn, attempt
-from jaxpg.watch.page import page
-from jaxpg.watch.untrained import untrained
+from jaxpg.watch.page import make_page
+from jaxpg.watch.untrained import make_untrained
 
 ROBOT = """<mujoco><worldbody>
   <body><joint name="slide" type="slide" axis="1 0 0"/><geom type="box" size=".2 .1 .05" {more}/>
@@ -38,7 +38,7 @@ BARE = """<mujoco><worldbody>
     <body><joint name="hinge" axis="0 -1 0"/><inertial pos="0 0 .3" mass=".1" diaginertia=".003 .003 .0001"/></body>
   </body></worldbody><actuator><motor joint="slide"/><motor joint="hinge"/></actuator></mujoco>"""
 
-UNKNOWN = "the policy has 1 command, the model 2 actuators: which drives which?"
+UNKNOWN = "the policy has 1 command, the model 2 actuators: cannot match them"
 
 
 @dataclass(frozen=True)
@@ -91,12 +91,14 @@ def shown(monkeypatch, tmp_path):
         env = entry.build(config.env)
         params = make_networks(config, env).init(jax.random.key(1))
         statistics = RunningStatistics(jnp.array(1.0), jnp.zeros(2), jnp.ones(2))
-        best = stored_policy(config, env, Policy(params, statistics), 1, "seed 0")
+        best = make_stored_policy(config, env, Policy(params, statistics), 1, "seed 0")
         lines = [{"update": 1, "steps": 10, "seconds": 1.0, "eval_return": -1.0}]
         (tmp_path / "metrics.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines))
         (tmp_path / "versions.json").write_text("{}")
-        data = report.report(RunFolder(tmp_path), config, {"before training": untrained(best), "best": best})
-        assert "<title>" in page(data)
+        data = run_page.build_report(
+            RunFolder(tmp_path), config, {"before training": make_untrained(best), "best": best}
+        )
+        assert "<title>" in make_page(data)
         return data
 
     return make
@@ -175,7 +177,7 @@ WRONG = [
     ),
     ({"qpos": lambda self, state: state.obs[:1]}, r"no picture of the robot: scene.qpos\(state\) has the shape \(1,\)"),
     ({"scene": Scene("robot", lambda state: state.obs)}, "no picture of the robot: scene.model is a str, expected"),
-    ({"dt": 0.0}, "no picture of the robot: dt is 0.0, expected the seconds"),
+    ({"dt": 0.0}, "no picture of the robot: dt is 0.0, expected seconds"),
     ({"dt": property(fails)}, "no picture of the robot: dt raises AttributeError"),
     (
         {"goal": (0.0, 1.0), "metrics": ("success",)},
@@ -203,7 +205,7 @@ def test_what_cannot_be_drawn_is_left_out_and_said_and_the_rest_stands(shown, at
 
 
 def test_a_critic_that_is_no_number_somewhere_has_no_portrait(shown, monkeypatch):
-    monkeypatch.setattr(player, "value_map", lambda *_: [np.full((3, 3), math.nan)])
+    monkeypatch.setattr(player, "compute_value_map", lambda *_: [np.full((3, 3), math.nan)])
     data = shown(phase_plane=plane())
     assert data["notes"] == ["no phase portrait: the critic's values are not finite everywhere"]
     assert data["player"]["policies"][0]["episodes"][0]["path"]
@@ -213,7 +215,7 @@ def test_a_bug_is_one_note_for_users_and_raised_for_whoever_asks(shown, monkeypa
     def broken(*_):
         raise KeyError("nothing of this name")
 
-    monkeypatch.setattr(report, "diagnostics", broken)
+    monkeypatch.setattr(run_page, "make_diagnostics", broken)
     monkeypatch.setenv(attempts.RAISE, "1")
     with pytest.raises(KeyError):
         shown()

@@ -47,7 +47,7 @@ def test_a_run_in_use_has_one_owner(command, command_environment, tmp_path):
             result = command("train", *arguments)
             assert (result.returncode, result.stdout) == (2, "")
             assert result.stderr == f"error: {folder} is in use by {name}, which is training in it\n"
-        assert f"just now, by {name}" in command("inspect", f"run={folder}").stdout
+        assert f"now, by {name}" in command("inspect", f"run={folder}").stdout
         assert tree(folder) == before
         process.send_signal(signal.SIGKILL)
         process.wait()
@@ -62,10 +62,10 @@ def test_without_locks_there_is_a_note(monkeypatch, tmp_path):
 
     monkeypatch.setattr(fcntl, "flock", unsupported)
     notes = []
-    with lock.held(tmp_path, notes.append):
+    with lock.hold(tmp_path, notes.append):
         assert len(notes) == 1
         assert "cannot be locked (Operation not supported)" in notes[0]
-        assert lock.owner(tmp_path) is None
+        assert lock.find_owner(tmp_path) is None
 
 
 def test_a_look_at_the_owner_keeps_nobody_from_becoming_it(tmp_path):
@@ -74,11 +74,11 @@ def test_a_look_at_the_owner_keeps_nobody_from_becoming_it(tmp_path):
     path.touch()
     descriptor = os.open(path, os.O_RDONLY)
     fcntl.flock(descriptor, fcntl.LOCK_SH)
-    with pytest.raises(UserError, match="is in use by another process"), lock.held(tmp_path, print):
+    with pytest.raises(UserError, match="is in use by another process"), lock.hold(tmp_path, print):
         pass
     os.close(descriptor)
-    with lock.held(tmp_path, print):
-        assert lock.owner(tmp_path) == f"process {os.getpid()} on {platform.node()}"
+    with lock.hold(tmp_path, print):
+        assert lock.find_owner(tmp_path) == f"process {os.getpid()} on {platform.node()}"
 
 
 @pytest.mark.parametrize(

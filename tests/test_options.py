@@ -14,12 +14,12 @@ from envs.options import (
     OptionError,
     build,
     convert,
-    declaration_problems,
     describe,
     describe_range,
-    nearest,
+    describe_unknown,
+    find_declaration_problems,
+    find_nearest,
     option,
-    unknown,
 )
 
 
@@ -203,17 +203,17 @@ def test_the_prefix_is_put_before_names_and_suggestions():
 
 @pytest.mark.parametrize("typo", ["nmber", "numbr", "numbers", "nubmer"])
 def test_the_nearest_name_is_suggested(typo):
-    assert unknown("option", typo, ["fraction", "number", "limit"]).endswith("did you mean 'number'?")
+    assert describe_unknown("option", typo, ["fraction", "number", "limit"]).endswith("did you mean 'number'?")
 
 
 def test_all_names_are_listed_in_order_where_none_is_near_and_they_are_few():
-    assert unknown("env", "qqq", ["pendulum", "arm"]) == "unknown env 'qqq': known are arm, pendulum"
+    assert describe_unknown("env", "qqq", ["pendulum", "arm"]) == "unknown env 'qqq': known are arm, pendulum"
 
 
 def test_many_names_are_not_listed():
     known = [f"long_name_{i}" for i in range(21)]
-    assert unknown("option", "qqq", known[:20]).count("long_name_") == 20
-    assert unknown("option", "qqq", known) == "unknown option 'qqq': see --help"
+    assert describe_unknown("option", "qqq", known[:20]).count("long_name_") == 20
+    assert describe_unknown("option", "qqq", known) == "unknown option 'qqq': see --help"
 
 
 @pytest.mark.parametrize(
@@ -261,12 +261,12 @@ def test_help_is_followed_by_the_range_if_there_is_one():
 )
 def test_what_is_before_the_dot_says_nothing_of_how_near_a_name_is(name, near):
     known = ["algo.actor_lr", "algo.critic_lr", "algo.gamma", "algo.n", "env.mass", "network.widths", "seed"]
-    assert nearest(name, known) == near
+    assert find_nearest(name, known) == near
 
 
 def test_known_names_of_a_group_are_listed_where_none_is_near():
     known = ["algo.gamma", "algo.n", *(f"network.width_{i}" for i in range(30))]
-    assert unknown("option", "algo.qqq", known) == "unknown option 'algo.qqq': known are algo.gamma, algo.n"
+    assert describe_unknown("option", "algo.qqq", known) == "unknown option 'algo.qqq': known are algo.gamma, algo.n"
 
 
 @pytest.mark.parametrize("kind", [np.int64, np.uint8, np.float32, np.float64])
@@ -314,11 +314,11 @@ def test_a_field_without_option_has_neither_help_nor_range():
 
 
 def test_options_are_declared_without_problems():
-    assert list(declaration_problems(Options)) == []
+    assert list(find_declaration_problems(Options)) == []
 
 
 @pytest.mark.parametrize("default", [-1.0, "much", None])
 def test_a_default_that_the_option_cannot_have_is_a_problem(default):
     kind = dataclasses.make_dataclass("Kind", [("mass", float, option(default, "of the link", above=0))])
-    (problem,) = declaration_problems(kind)
+    (problem,) = find_declaration_problems(kind)
     assert problem.startswith(f"option 'mass': its default {default!r}: ")

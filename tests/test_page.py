@@ -12,7 +12,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from jaxpg.watch.page import PARTS, SCRIPTS, page
+from jaxpg.watch.page import PARTS, SCRIPTS, make_page
 
 
 class Document(HTMLParser):
@@ -38,13 +38,13 @@ class Document(HTMLParser):
 
 
 def test_the_page_asks_for_nothing():
-    text = page(pages.pendulum())
+    text = make_page(pages.pendulum())
     assert [link for link in Document(text).fetched if link != "data:,"] == []
     assert not re.search(r"@import|url\((?!#)|\bfetch\(|XMLHttpRequest|WebSocket|EventSource|sendBeacon|import\(", text)
 
 
 def test_the_policy_allows_this_style_and_this_script_and_nothing_else():
-    document = Document(page(pages.pendulum()))
+    document = Document(make_page(pages.pendulum()))
     assert document.policy["default-src"] == "'none'"
     for rule, element in [("style-src", ("style", None)), ("script-src", ("script", "module"))]:
         digest = base64.b64encode(hashlib.sha256(document.texts[element].encode()).digest()).decode()
@@ -62,11 +62,11 @@ def test_every_script_is_in_the_page_and_none_is_long():
 @given(st.text(), st.lists(st.tuples(st.text(), st.text())))
 def test_the_page_embeds_exactly_the_data(title, facts):
     data = pages.document("run", title + pages.NASTY, facts=[list(pair) for pair in facts])
-    document = Document(page(data))
+    document = Document(make_page(data))
     assert json.loads(document.texts["script", "application/json"]) == data
-    assert page(data).count("<script") == 2
+    assert make_page(data).count("<script") == 2
 
 
 def test_a_number_that_is_not_finite_is_refused():
     with pytest.raises(ValueError, match="JSON"):
-        page(pages.document("run", "a run", tables=[{"title": "", "columns": ["x"], "rows": [[math.nan]]}]))
+        make_page(pages.document("run", "a run", tables=[{"title": "", "columns": ["x"], "rows": [[math.nan]]}]))

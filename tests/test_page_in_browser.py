@@ -10,7 +10,7 @@ import pages
 import pytest
 from browsers import frame_of, scrub, seen, stage_pixel
 
-from jaxpg.watch.page import page
+from jaxpg.watch.page import make_page
 
 
 @pytest.fixture(scope="module")
@@ -26,7 +26,7 @@ def show(tab_with, tmp_path):
     path, used = tmp_path / "page.html", []
 
     def opened(data, **options):
-        path.write_text(page(data), encoding="utf-8")
+        path.write_text(make_page(data), encoding="utf-8")
         used.append(tab_with(**options))
         used[-1].page.set_viewport_size({"width": 1280, "height": 900})
         used[-1].page.goto(path.as_uri())
@@ -251,7 +251,7 @@ def test_references_are_lines_where_there_is_room_and_words_elsewhere(show):
     first = tab.locator(".curve").first
     assert first.locator(".reference").count() == 1
     assert "best possible \u2212137.4" in first.text_content()
-    assert tab.get_by_text("outside of the picture").inner_text().endswith("far away \u2212100,000")
+    assert tab.get_by_text("outside the picture").inner_text().endswith("far away \u2212100,000")
 
 
 def test_the_head_says_what_the_policies_are_worth_and_the_foot_how_to_get_them(show):
@@ -294,7 +294,7 @@ def test_a_part_that_fails_takes_nothing_else_with_it(tab_with, tmp_path):
     data = pages.pendulum()
     data["portrait"]["values"] = None
     path = tmp_path / "broken.html"
-    path.write_text(page(data), encoding="utf-8")
+    path.write_text(make_page(data), encoding="utf-8")
     tab = tab_with().page.context.new_page()
     tab.goto(path.as_uri())
     tab.wait_for_selector(".curve svg", state="attached")
@@ -374,7 +374,7 @@ def test_texts_are_never_read_as_html(show):
 
 @pytest.mark.parametrize("policy", [True, False])
 def test_no_request_can_leave_the_page_and_the_policy_is_why(tab_with, policy):
-    text = page(pages.comparison())
+    text = make_page(pages.comparison())
     server = browsers.Server(text if policy else re.sub("<meta http-equiv.*>", "", text))
     tab = tab_with().page.context.new_page()
     tab.goto(server.url)

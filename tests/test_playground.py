@@ -144,7 +144,7 @@ def test_unknown_names_are_answered_with_the_nearest(playground):
     [
         (subprocess.CalledProcessError(128, ["git", "clone"]), "could not download"),
         (FileNotFoundError(2, "No such file or directory", "git"), "could not download"),
-        (AttributeError("'MjSpec' object has no attribute 'find_body'"), "do not go together"),
+        (AttributeError("'MjSpec' object has no attribute 'find_body'"), "does not work with this release"),
     ],
 )
 def test_what_cannot_be_made_is_one_line(playground, error, words):

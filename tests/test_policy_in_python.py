@@ -11,7 +11,7 @@ from stored import a_policy
 
 import jaxpg
 from jaxpg.deploy import reference
-from jaxpg.deploy.controller import controller
+from jaxpg.deploy.controller import make_controller
 from jaxpg.errors import UserError
 from jaxpg.store import policies
 
@@ -41,7 +41,7 @@ def drawn(monkeypatch):
 def test_commands_are_the_formulas(drawn):
     stored, policy = drawn("env=arm", "network.widths=[8]")
     obs = np.random.default_rng(0).normal(size=(5, 4, policy.observation_size))
-    expected = reference.commands(controller(stored, {}), np.float32(obs).reshape(20, -1)).reshape(5, 4, 2)
+    expected = reference.compute_commands(make_controller(stored, {}), np.float32(obs).reshape(20, -1)).reshape(5, 4, 2)
     command = policy(obs)
     assert isinstance(command, np.ndarray)
     np.testing.assert_allclose(command, expected, rtol=0, atol=1e-5)
@@ -94,7 +94,7 @@ def test_mistakes_say_what_would_be_right(run, drawn, tmp_path):
         jaxpg.load(run, checkpoint="newest")
     _, policy = drawn("env=pendulum", "network.widths=[8]")
     for shape in ((), (4,), (3, 4)):
-        with pytest.raises(ValueError, match=r"an observation is \[3\], several are \[\.\.\., 3\]; this one is"):
+        with pytest.raises(ValueError, match=r"expected an observation of shape \[3\] or \[\.\.\., 3\], not "):
             policy(np.zeros(shape))
 
 

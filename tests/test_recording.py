@@ -7,17 +7,17 @@ import pytest
 from stored import a_policy
 
 from envs.pendulum import observe
-from envs.scenes import scene
+from envs.scenes import find_scene
 from jaxpg import normalization
 from jaxpg.evaluation import evaluate
 from jaxpg.program.algorithms import make_algorithm
 from jaxpg.program.networks import make_networks
 from jaxpg.program.state import initial_run
 from jaxpg.watch import drawing
-from jaxpg.watch.clips import clip
-from jaxpg.watch.player import in_plane
-from jaxpg.watch.recording import record, value_map
-from jaxpg.watch.untrained import untrained
+from jaxpg.watch.clips import make_clip
+from jaxpg.watch.player import wrap_coordinates
+from jaxpg.watch.recording import compute_value_map, record
+from jaxpg.watch.untrained import make_untrained
 
 STARTS = 5
 PENDULUM = ("env=pendulum", "network.widths=[8]", "env.episode_length=40", "num_envs=2", "algo.num_shards=1")
@@ -80,21 +80,21 @@ def test_rewards_after_the_end_of_an_episode_do_not_count(recorded):
     ended = recording._replace(length=np.array([1, 40, 7, 40, 40]))
     assert ended.episode_return[0] == pytest.approx(recording.reward[0, 0])
     assert ended.episode_return[2] == pytest.approx(recording.reward[:7, 2].sum(), rel=1e-5)
-    short = clip(stored, ended, 2)
+    short = make_clip(stored, ended, 2)
     assert len(short.look.qpos) == 8
     assert {len(values) for values in short.series.values()} == {7}
 
 
 def test_a_clip_with_fewer_frames_is_every_so_many_steps_of_the_whole(recorded):
     stored, recording = recorded(ARM)
-    whole, short = clip(stored, recording, 1), clip(stored, recording, 1, most=10)
+    whole, short = make_clip(stored, recording, 1), make_clip(stored, recording, 1, most=10)
     assert short.dt == pytest.approx(3 * whole.dt)
     np.testing.assert_array_equal(short.look.qpos, whole.look.qpos[::3])
     np.testing.assert_array_equal(short.series["reward"], whole.series["reward"][::3])
     assert short.episode_return == whole.episode_return
     np.testing.assert_allclose(short.so_far[1], whole.series["reward"][:3].sum(), rtol=1e-6)
     np.testing.assert_allclose(whole.so_far[-1], whole.episode_return, rtol=1e-6)
-    ended = clip(stored, recording._replace(length=np.full(STARTS, 7)), 1, most=10)
+    ended = make_clip(stored, recording._replace(length=np.full(STARTS, 7)), 1, most=10)
     np.testing.assert_array_equal(ended.look.qpos, whole.look.qpos[[0, 3, 6, 7]])
     np.testing.assert_array_equal(ended.series["reward"], whole.series["reward"][[0, 3, 6]])
     assert ended.so_far[-1] == pytest.approx(ended.episode_return)
@@ -105,7 +105,7 @@ def test_the_policy_before_training_is_the_one_that_training_begins_with():
     stored = a_policy(*PENDULUM)
     begun = jax.jit(lambda seed: initial_run(make_algorithm(stored.config, stored.env), seed).train)
     same, other = (begun(np.uint32(seed)) for seed in (stored.config.run.seed, stored.config.run.seed + 1))
-    found = untrained(stored)
+    found = make_untrained(stored)
     assert found.update == 0
     assert largest_difference(found.policy.params, same.params) < 1e-6
     assert largest_difference(found.policy.params, other.params) > 0.01
@@ -117,13 +117,13 @@ def test_the_policy_before_training_is_the_one_that_training_begins_with():
 
 def ends(picture, frames):
     """Of parts with two points each, `[F, P, 2, 2]`."""
-    return drawing.points(picture, frames).reshape(len(frames.place), -1, 2, 2)
+    return drawing.outline_points(picture, frames).reshape(len(frames.place), -1, 2, 2)
 
 
 def test_a_pendulum_is_drawn_as_its_angle_says():
     """From the pivot to the tip, which is at (-sin theta, cos theta) seen against +y: positive angles lean left."""
-    view = scene(a_policy(*PENDULUM).env)
-    picture, theta = drawing.picture(view.model), np.linspace(-7, 7, 50)
+    view = find_scene(a_policy(*PENDULUM).env)
+    picture, theta = drawing.make_picture(view.model), np.linspace(-7, 7, 50)
     rod = ends(picture, drawing.draw(picture, theta[:, None]))[:, 0]
     order = np.argsort(np.linalg.norm(rod, axis=-1), axis=1)
     pivot, tip = (np.take_along_axis(rod, order[:, i, None, None], axis=1)[:, 0] for i in (0, 1))
@@ -135,10 +135,10 @@ def test_a_pendulum_is_drawn_as_its_angle_says():
 
 def test_an_arm_is_drawn_as_its_angles_say_and_its_goal_where_it_is():
     stored = a_policy(*ARM)
-    view, upper, fore = scene(stored.env), *stored.env.lengths
+    view, upper, fore = find_scene(stored.env), *stored.env.lengths
     state = stored.env.reset(jax.random.key(5))
     qpos = np.array([[0.3, -1.2], [2.0, 0.5]])
-    picture = drawing.picture(view.model)
+    picture = drawing.make_picture(view.model)
     frames = drawing.draw(picture, qpos, np.array(view.goal(state))[None])
     shoulder, wrist = qpos[:, 0], qpos.sum(axis=1)
     elbow = upper * np.stack([np.cos(shoulder), np.sin(shoulder)], axis=1)
@@ -151,8 +151,8 @@ def test_an_arm_is_drawn_as_its_angles_say_and_its_goal_where_it_is():
 
 
 def test_what_is_drawn_lies_in_its_rectangle():
-    view = scene(a_policy(*ARM).env)
-    picture = drawing.picture(view.model)
+    view = find_scene(a_policy(*ARM).env)
+    picture = drawing.make_picture(view.model)
     frames = drawing.draw(picture, np.array([[0.0, 0.0], [np.pi / 2, 0.0]]), np.array([[-0.5, 0.2, 0.0]]))
     x_min, y_min, x_max, y_max = drawing.extent(picture, [frames], margin=0.0)
     # Stretched along x, then along y, with the radius of the rods; and the goal on the other side.
@@ -160,13 +160,13 @@ def test_what_is_drawn_lies_in_its_rectangle():
 
 
 def test_a_robot_that_travels_stays_in_the_picture():
-    view = scene(a_policy(*ARM).env)
-    picture = drawing.picture(view.model)
-    still = drawing.points(picture, drawing.draw(picture, np.zeros((10, 2))))
+    view = find_scene(a_policy(*ARM).env)
+    picture = drawing.make_picture(view.model)
+    still = drawing.outline_points(picture, drawing.draw(picture, np.zeros((10, 2))))
     travelling = still + np.linspace(0, 20, 10)[:, None, None] * np.array([1.0, 0.0])
-    moved = travelling - drawing.followed(travelling)[:, None]
+    moved = travelling - drawing.find_center(travelling)[:, None]
     assert np.ptp(moved[..., 0]) == pytest.approx(np.ptp(still[..., 0]))
-    assert not drawing.followed(still).any()
+    assert not drawing.find_center(still).any()
 
 
 # --- the phase plane --------------------------------------------------------------------------------------------------
@@ -174,7 +174,7 @@ def test_a_robot_that_travels_stays_in_the_picture():
 
 def test_the_map_holds_the_value_of_each_state():
     stored = a_policy(*PENDULUM)
-    (values,) = value_map(stored, [stored.policy], columns=5, rows=3)
+    (values,) = compute_value_map(stored, [stored.policy], columns=5, rows=3)
     assert values.shape == (3, 5)
     for row, speed in enumerate((-8.0, 0.0, 8.0)):
         for column, theta in enumerate(np.linspace(-np.pi, np.pi, 5)):
@@ -185,7 +185,7 @@ def test_the_map_holds_the_value_of_each_state():
 def test_an_angle_is_within_its_turn():
     plane = a_policy(*PENDULUM).env.phase_plane
     angles = np.array([-np.pi, 3 * np.pi - 0.1, -7.0, 0.5])
-    found = in_plane(plane, np.stack([angles, np.full(4, 9.0)], axis=1))
+    found = wrap_coordinates(plane, np.stack([angles, np.full(4, 9.0)], axis=1))
     assert (found[:, 0] >= -np.pi).all()
     assert (found[:, 0] < np.pi).all()
     np.testing.assert_allclose(np.exp(1j * found[:, 0]), np.exp(1j * angles), atol=1e-12)

@@ -167,11 +167,11 @@ DECLARATIONS = {
     "a dict": (config_with(gains=(dict[str, float], None)), "option 'gains' is dict[str, float]: expected int, float"),
     "options within options": (config_with(inner=(Config, Config())), "option 'inner' is Config: expected int, float"),
     "anything": (config_with(what=(object, None)), "option 'what' is object: expected int, float"),
-    "a name that means nothing": (config_with(what=("Nothing", 1)), "an annotation of Options means nothing"),
+    "a name that means nothing": (config_with(what=("Nothing", 1)), "an annotation of Options cannot be evaluated"),
     "a default of another type": (config_with(gain=(float, "high")), "'gain': its default 'high': expected a number"),
     "letters that no command line has": (
         config_with(länge=(float, 1.0)),
-        "option 'länge': a command line can say ASCII",
+        "option 'länge': expected ASCII",
     ),
     "no dataclass": (dict, "its config must be a dataclass of options, not <class 'dict'>"),
     "an instance": (Config(), "its config must be a dataclass of options, not Config("),

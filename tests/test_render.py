@@ -17,7 +17,7 @@ from PIL import Image, ImageSequence
 from stored import a_policy
 
 from envs.options import OptionError
-from envs.scenes import scene
+from envs.scenes import find_scene
 from jaxpg import render as command_line
 from jaxpg.errors import UserError
 from jaxpg.watch import gl, movie, video
@@ -48,12 +48,12 @@ SIZE = 120
 def test_what_the_user_asks_for_comes_before_egl_and_that_before_osmesa(asked, there, found, tried):
     attempts = []
     environment = {} if asked is None else {"MUJOCO_GL": asked}
-    assert gl.backend(environment, lambda name: attempts.append(name) or name in there, "linux") == found
+    assert gl.find_backend(environment, lambda name: attempts.append(name) or name in there, "linux") == found
     assert attempts == tried
 
 
 def test_a_mac_has_a_backend_of_its_own():
-    assert gl.backend({}, lambda name: name == "", "darwin") == ""
+    assert gl.find_backend({}, lambda name: name == "", "darwin") == ""
 
 
 @pytest.mark.parametrize(
@@ -67,12 +67,12 @@ def test_a_mac_has_a_backend_of_its_own():
 )
 def test_where_there_is_no_opengl_the_line_says_what_to_install(asked, message):
     with pytest.raises(UserError, match=message):
-        gl.backend({"MUJOCO_GL": asked}, lambda name: False, "linux")
+        gl.find_backend({"MUJOCO_GL": asked}, lambda name: False, "linux")
 
 
 def test_a_backend_that_fails_fails_elsewhere():
     """MuJoCo refuses this name when it is imported, which here it may have been long ago."""
-    assert not gl.works("no-such-backend")
+    assert not gl.is_working("no-such-backend")
 
 
 # --- the pictures -----------------------------------------------------------------------------------------------------
@@ -81,7 +81,7 @@ def test_a_backend_that_fails_fails_elsewhere():
 @pytest.fixture(scope="module")
 def backend():
     try:
-        return gl.backend(os.environ, gl.works)
+        return gl.find_backend(os.environ, gl.is_working)
     except UserError as error:
         pytest.skip(str(error))
 
@@ -95,8 +95,8 @@ def draw(backend):
 
         @functools.cache
         def canvas(options, number, size):
-            view = scene(a_policy(*options).env)
-            return stack.enter_context(Canvas(view.model, backend, video.grid(number), size, view.goal_radius))
+            view = find_scene(a_policy(*options).env)
+            return stack.enter_context(Canvas(view.model, backend, video.choose_grid(number), size, view.goal_radius))
 
         def drawn(options, *states, size=(SIZE, SIZE)):
             cells = [Cell(*(None if x is None else np.array(x, float) for x in state), "") for state in states]
@@ -107,7 +107,7 @@ def draw(backend):
 
 def pixel(options, point, size=(SIZE, SIZE)):
     """Column and row at which the model's first camera sees a point [m]; and how many pixels a metre is there."""
-    model, (width, height) = scene(a_policy(*options).env).model, size
+    model, (width, height) = find_scene(a_policy(*options).env).model, size
     x, y, z = model.cam_mat0[0].reshape(3, 3).T @ (np.array(point) - model.cam_pos[0])
     unit = height / 2 / math.tan(math.radians(model.cam_fovy[0]) / 2) / -z
     return np.array([width / 2 + x * unit, height / 2 - y * unit]) - 0.5, unit
@@ -133,7 +133,7 @@ def test_the_goal_is_where_it_is_and_as_large(goal, draw):
     mask = changed(draw(ARM, (qpos, goal, (0, 0))), draw(ARM, (qpos, None, (0, 0))))
     place, unit = pixel(ARM, goal)
     np.testing.assert_allclose(where(mask).mean(axis=0), place, atol=0.7)
-    assert math.sqrt(mask.sum() / math.pi) == pytest.approx(unit * scene(a_policy(*ARM).env).goal_radius, abs=0.7)
+    assert math.sqrt(mask.sum() / math.pi) == pytest.approx(unit * find_scene(a_policy(*ARM).env).goal_radius, abs=0.7)
 
 
 @pytest.mark.parametrize(
@@ -208,7 +208,7 @@ def test_the_whole_workspace_is_seen(options, joints, size, draw):
 
 def test_a_grid_has_the_pictures_side_by_side(draw):
     """Row by row; each is what it is alone, but for the line between them; where there is none left it is grey."""
-    from jaxpg.watch.canvas import BEYOND, BORDER
+    from jaxpg.watch.canvas import BORDER, EMPTY
 
     states = [((theta,), None, (0.5,)) for theta in (0.0, 1.0, 2.0)]
     image = draw(PENDULUM, *states)
@@ -218,13 +218,13 @@ def test_a_grid_has_the_pictures_side_by_side(draw):
     places = image.reshape(2, SIZE, 2, SIZE, 3).swapaxes(1, 2).reshape(4, SIZE, SIZE, 3)[:, 1:, 1:]
     for found, state in zip(places, states, strict=False):
         np.testing.assert_allclose(found, draw(PENDULUM, state)[1:, 1:], atol=2)
-    np.testing.assert_allclose(places[3], np.round(255 * BEYOND[0]), atol=1)
+    np.testing.assert_allclose(places[3], np.round(255 * EMPTY[0]), atol=1)
 
 
 def test_pictures_with_captions_differ_in_a_corner_alone(backend):
     from jaxpg.watch.canvas import Canvas, Cell
 
-    view = scene(a_policy(*PENDULUM).env)
+    view = find_scene(a_policy(*PENDULUM).env)
     with Canvas(view.model, backend, (1, 1), (2 * SIZE, 2 * SIZE)) as canvas:
         first, second = (canvas.draw([Cell(np.zeros(1), None, np.zeros(1), text)]) for text in ("", "1.00 s"))
     points = where((first != second).any(axis=-1))
@@ -234,7 +234,7 @@ def test_pictures_with_captions_differ_in_a_corner_alone(backend):
 
 @given(number=st.integers(1, 64))
 def test_a_grid_has_a_place_for_each_and_no_row_too_many(number):
-    rows, columns = video.grid(number)
+    rows, columns = video.choose_grid(number)
     assert (rows - 1) * columns < number <= rows * columns
     assert rows <= columns <= rows + 1
 
@@ -248,14 +248,14 @@ def test_a_grid_has_a_place_for_each_and_no_row_too_many(number):
     most=st.integers(1, 240),
 )
 def test_pictures_come_in_time_and_not_too_fast(dt, speed, most):
-    every, seconds = video.pace(dt, speed, most)
+    every, seconds = video.choose_pace(dt, speed, most)
     assert float(seconds) == pytest.approx(every * dt / speed, rel=1e-6)
     assert seconds * most >= 1
     assert every == 1 or (seconds / every) * (every - 1) * most < 1  # one step less would be too fast
 
 
 def test_a_step_that_float_has_not_exactly_is_not_left_out():
-    assert video.pace(float(np.float32(0.02)), 1.0, 50) == (1, Fraction(1, 50))
+    assert video.choose_pace(float(np.float32(0.02)), 1.0, 50) == (1, Fraction(1, 50))
 
 
 def made_clip(length, success=None):
@@ -268,8 +268,8 @@ def made_clip(length, success=None):
 def test_after_its_end_an_episode_shows_its_last_frame():
     stored = a_policy(*PENDULUM)
     one, other = made_clip(5), made_clip(3, success=True)
-    assert video.shown([one, other], 2) == [0, 2, 4, 5]
-    cells = [video.cell(stored, scene(stored.env), other, step) for step in range(6)]
+    assert video.shown_steps([one, other], 2) == [0, 2, 4, 5]
+    cells = [video.make_cell(stored, find_scene(stored.env), other, step) for step in range(6)]
     assert [float(cell.qpos[0]) for cell in cells] == [0, 1, 2, 3, 3, 3]
     assert [float(cell.efforts[0]) for cell in cells] == [0, 0.125, 0.25, 0, 0, 0]  # of the limit, 2 N m
     assert cells[2].caption == "0.10 s  return 0.2"
@@ -322,9 +322,9 @@ def test_what_is_written_is_read_back_in_time(suffix, seconds, tmp_path):
 @settings(deadline=None)
 @given(number=st.integers(1, 200), rate=st.fractions(1, 50, max_denominator=1000))
 def test_delays_of_a_gif_never_drift(number, rate):
-    found = np.cumsum(movie.delays(number, 1 / rate))
+    found = np.cumsum(movie.compute_delays(number, 1 / rate))
     assert np.abs(found - [100 * float(i / rate) for i in range(1, number + 1)]).max() <= 0.5 + 1e-9
-    assert min(movie.delays(number, 1 / rate)) >= 2  # what is shorter, browsers show slowly
+    assert min(movie.compute_delays(number, 1 / rate)) >= 2  # what is shorter, browsers show slowly
 
 
 # --- the command ------------------------------------------------------------------------------------------------------
@@ -363,7 +363,7 @@ def test_episodes_of_a_run_become_a_video(run, backend, capsys):
     [
         (("out={run}",), "must end in .mp4 or .gif"),
         (("out={run}/video.avi",), r"out=.*video.avi: must end in .mp4 or .gif"),
-        (("out={run}/folder.gif",), "there is a folder of that name"),
+        (("out={run}/folder.gif",), "a folder has that name"),
         (("out={run}/v.gif", "width=99"), "width=99: must be even"),
         (("out={run}/v.gif", "episodes=64", "width=2000"), "64 episodes of 2000 x 360 are 16000 x 2880 pixels, more"),
         (("out={run}/v.gif", "checkpoint=first"), "checkpoint=first: must be best or last or untrained"),
@@ -372,7 +372,7 @@ def test_episodes_of_a_run_become_a_video(run, backend, capsys):
 )
 def test_mistakes_are_one_line(arguments, message, run, monkeypatch):
     (run / "folder.gif").mkdir()
-    monkeypatch.setattr(gl, "works", lambda name: True)
+    monkeypatch.setattr(gl, "is_working", lambda name: True)
     with pytest.raises((UserError, OptionError), match=message) as raised:
         command_line.main([f"run={run}", *(argument.format(run=run) for argument in arguments)])
     assert "\n" not in str(raised.value)
@@ -380,9 +380,9 @@ def test_mistakes_are_one_line(arguments, message, run, monkeypatch):
 
 
 def test_what_has_no_body_is_not_drawn(run, monkeypatch):
-    monkeypatch.setattr(gl, "works", lambda name: True)
+    monkeypatch.setattr(gl, "is_working", lambda name: True)
     monkeypatch.setattr("jaxpg.store.policies.load", lambda *_: a_policy("env=quadratic", "network=linear"))
-    with pytest.raises(UserError, match="env=quadratic is no robot: there is nothing to be seen of it"):
+    with pytest.raises(UserError, match="env=quadratic has no robot that could be drawn"):
         command_line.main([f"run={run}", f"out={run / 'v.gif'}"])
 
 

@@ -9,8 +9,8 @@ import pytest
 
 from jaxpg import report as command_line
 from jaxpg.store.folder import RunFolder, read_metrics
-from jaxpg.watch.curves import curve, finite, numbers
-from jaxpg.watch.player import packed
+from jaxpg.watch.curves import make_curve, replace_nonfinite, round_numbers
+from jaxpg.watch.player import pack
 
 TINY = ("num_envs=4", "num_steps=4", "log_interval=64", "eval_interval=64", "total_steps=256")
 TASKS = {
@@ -149,18 +149,18 @@ def test_the_page_can_be_written_anew(run, capsys):
 
 def test_numbers_are_packed_to_half_a_unit():
     values = np.array([[-32767.0, 0.4, 32767.0]])
-    assert unpacked(packed(values), 3).tolist() == [-32767, 0, 32767]
+    assert unpacked(pack(values), 3).tolist() == [-32767, 0, 32767]
 
 
 def test_what_is_not_finite_is_nothing():
-    assert finite({"a": [1.0, float("nan")], "b": (float("inf"), "x", None)}) == {
+    assert replace_nonfinite({"a": [1.0, float("nan")], "b": (float("inf"), "x", None)}) == {
         "a": [1.0, None],
         "b": [None, "x", None],
     }
-    assert numbers(np.array([1 / 3, 123456.0])) == [0.3333, 123500.0]
+    assert round_numbers(np.array([1 / 3, 123456.0])) == [0.3333, 123500.0]
 
 
 def test_a_curve_of_one_agent_has_no_interval():
-    one, several = (curve("x", np.arange(3), np.ones((agents, 3))) for agents in (1, 2))
+    one, several = (make_curve("x", np.arange(3), np.ones((agents, 3))) for agents in (1, 2))
     assert one["low"] is None
     assert several["low"] == several["high"] == [1.0, 1.0, 1.0]

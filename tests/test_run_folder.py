@@ -81,7 +81,7 @@ def test_a_run_whose_folder_is_moved_goes_on_there(command, command_environment,
         assert process.wait() == 0, said
     assert tree(place) == other
     assert outcome(away) == outcome(undisturbed)
-    assert said.count(f"note: {place} was moved: the run goes on in {away}\n") == 1
+    assert said.count(f"note: {place} was moved: the run continues in {away}\n") == 1
     assert f"run={away}" in said
     assert (away / "learning_curve.png").stat().st_size > 1000
     assert not (away / lock.NAME).exists()
@@ -97,7 +97,7 @@ def system(request, monkeypatch):
 
 def test_checkpoints_are_in_the_folder_that_is_owned_or_nowhere(system, tmp_path):
     run_folder, away = RunFolder(tmp_path / "run"), tmp_path / "away"
-    with folder.owned(run_folder, print):
+    with folder.own(run_folder, print):
         checkpoints = Checkpoints(run_folder.checkpoints)
         checkpoints.save(1, {"x": np.arange(3.0)}, {})
         (tmp_path / "run").rename(away)
@@ -149,7 +149,7 @@ def test_a_run_that_goes_on_follows_no_link(run, outside, name, target):
     assert contents(outside) == before
     assert ending[0] == WRITTEN[name], ending
     if ending[0]:
-        assert "it is a link, and what is in a run folder must be its own" in one_line(ending)
+        assert "it is a link, and a run folder must not contain links" in one_line(ending)
     else:
         assert ending[2] == ""
 
@@ -205,7 +205,7 @@ def test_a_run_may_have_any_name_that_can_be_printed(tmp_path, name):
 
 @pytest.mark.parametrize("name", ["two\nlines", "tab\t", "latin-1 \udce9", "bell\a"])
 def test_a_name_that_cannot_be_printed_is_refused(tmp_path, name):
-    assert "expected letters that can be printed" in one_line(ended(train.main, [*TINY, f"run_dir={tmp_path / name}"]))
+    assert "expected printable characters" in one_line(ended(train.main, [*TINY, f"run_dir={tmp_path / name}"]))
     assert list(tmp_path.iterdir()) == []
 
 
@@ -298,19 +298,19 @@ objects = st.dictionaries(st.sampled_from(list(line_at(1))), values).map(json.du
 @given(st.integers(3, 12), st.data())
 def test_a_damaged_line_costs_no_other(number, data):
     written = [line_at(update) for update in range(1, number + 1)]
-    texts_written = [lines.json_line(line) for line in written]
+    texts_written = [lines.format_line(line) for line in written]
     at = data.draw(st.integers(0, number - 1))
     texts_written[at] = data.draw(texts | objects) + "\n"
-    found, damaged = lines.sound("".join(texts_written))
+    found, damaged = lines.parse_lines("".join(texts_written))
     assert [line for line in found if line["update"] != at + 1] == written[:at] + written[at + 1 :]
     assert damaged in ([], [at + 1])
 
 
 @given(st.integers(1, 5), st.integers(0, 200))
 def test_a_torn_last_line_is_not_damaged(number, cut):
-    whole = "".join(lines.json_line(line_at(update)) for update in range(1, number + 1))
-    torn = lines.json_line(line_at(number + 1))[:cut]
-    found, damaged = lines.sound(whole + torn)
+    whole = "".join(lines.format_line(line_at(update)) for update in range(1, number + 1))
+    torn = lines.format_line(line_at(number + 1))[:cut]
+    found, damaged = lines.parse_lines(whole + torn)
     assert (found[:number], damaged) == ([line_at(update) for update in range(1, number + 1)], [])
 
 
@@ -320,7 +320,7 @@ def test_a_run_that_goes_on_keeps_the_lines_after_a_damaged_one(run):
     path.write_text("\n".join([before[0], before[1][:-9], *before[2:]]) + "\n")
     status, out, error = ended(train.main, [f"resume={run}", "total_steps=128"])
     assert (status, error) == (0, "")
-    assert f"note: {path}: line 2 is damaged and left out; the others are kept" in out
+    assert f"note: {path}: line 2 is damaged and dropped; the others are kept" in out
     assert path.read_text().splitlines()[:5] == [before[0], *before[2:]]
     assert [line["update"] for line in read_metrics(RunFolder(run))] == [2, 6, 8, 10, 12, 14, 16]
 
@@ -345,7 +345,7 @@ DAMAGES = {
     "a deep list": lambda path: path.write_text("[" * 5000),
     "earlier versions that are none": lambda path: path.write_text('{"threads": 1, "jaxlib": "0", "earlier": 5}'),
     "earlier versions in words": lambda path: path.write_text('{"threads": 1, "jaxlib": "0", "earlier": ["old"]}'),
-    "too many threads": lambda path: path.write_text(f'{{"threads": {folder.MOST_THREADS + 1}, "jaxlib": "0"}}'),
+    "too many threads": lambda path: path.write_text(f'{{"threads": {folder.MAX_THREADS + 1}, "jaxlib": "0"}}'),
 }
 COMMANDS = READERS | {"inspect": (inspect, ["run={run}"]), "compare": (compare, ["{run}", "out={run}/page.html"])}
 
@@ -381,15 +381,15 @@ def test_versions_name_the_commit_of_a_checkout(tmp_path, monkeypatch):
     module = tmp_path / "jaxpg" / "run" / "versions.py"
     module.write_text("")
     monkeypatch.setattr(versions, "__file__", str(module))
-    assert versions.commit() is None
+    assert versions.find_commit() is None
     for arguments in (["init", "-q"], ["add", "."], ["commit", "-qm", "first"]):
         subprocess.run([*git, *arguments], check=True)
     head = subprocess.run([*git, "rev-parse", "HEAD"], capture_output=True, text=True, check=True).stdout.strip()
-    assert versions.commit() == head
+    assert versions.find_commit() == head
     module.write_text("x = 1\n")
-    assert versions.commit() == f"{head}-dirty"
+    assert versions.find_commit() == f"{head}-dirty"
     monkeypatch.setenv("PATH", "")
-    assert versions.commit() is None
+    assert versions.find_commit() is None
 
 
 def test_another_commit_is_noted_and_not_as_other_bits(run):

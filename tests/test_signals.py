@@ -144,7 +144,7 @@ def test_runs_that_begin_in_one_second_have_folders_of_their_own(monkeypatch, tm
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(time, "strftime", lambda form: "now")
     config, found = compose(["env=quadratic"]), []
-    threads = [threading.Thread(target=lambda: found.append(folder.planned(config).path)) for _ in range(8)]
+    threads = [threading.Thread(target=lambda: found.append(folder.choose(config).path)) for _ in range(8)]
     for thread in threads:
         thread.start()
     for thread in threads:
@@ -159,6 +159,6 @@ def test_the_default_folder_is_in_runs_whatever_the_environment_is_called(name, 
 
     register(monkeypatch, name)
     monkeypatch.chdir(tmp_path)
-    path = folder.planned(compose(["env=" + repr(name)])).path
+    path = folder.choose(compose(["env=" + repr(name)])).path
     assert path.parent.as_posix() == "runs"
     assert path.is_dir()

@@ -9,11 +9,11 @@ from hypothesis.extra.numpy import arrays
 
 from jaxpg.store.statistics import (
     bootstrap_interval,
-    fewest_seeds,
     improvement_interval,
     interquartile_mean,
+    min_seeds,
     probability_of_improvement,
-    spread,
+    seed_interval,
 )
 
 numbers = st.floats(-1e3, 1e3)
@@ -102,7 +102,7 @@ def test_interval_stays_within_the_scores():
 @pytest.mark.parametrize("confidence", [0.5, 0.75, 0.9, 0.95, 0.99])
 def test_an_interval_within_the_seeds_can_hold_their_median_as_often_as_it_says(confidence):
     """All S lie on one side of the median with probability 2 / 2^S; with a seed less that is more than is allowed."""
-    number = fewest_seeds(confidence)
+    number = min_seeds(confidence)
     assert 2 / 2**number <= 1 - confidence + 1e-12 < 2 / 2 ** (number - 1) + 2e-12
 
 
@@ -111,7 +111,7 @@ def test_too_few_seeds_have_no_interval_but_a_range(number):
     scores = random_scores(number, columns=2)
     low, high = bootstrap_interval(scores, resamples=100)
     assert np.isfinite([low, high]).all() == (number >= 6)
-    low, high = spread(scores)
+    low, high = seed_interval(scores)
     assert (scores.min(axis=0) <= low).all()
     assert (high <= scores.max(axis=0)).all()
     if number < 6:

@@ -12,7 +12,7 @@ from rich.console import Console
 
 from jaxpg.run import terminal
 from jaxpg.store import cache, stderr
-from jaxpg.store.stderr import filtered
+from jaxpg.store.stderr import filter_stderr
 
 LINE = {"update": 2, "steps": 50, "return": -3.0, "eval_return": -2.5, "seconds": 1.0}
 
@@ -54,7 +54,7 @@ def test_the_rate_counts_the_steps_of_all_agents(num_agents, monkeypatch, capsys
 
 def test_what_takes_its_time_is_named_with_a_clock_or_in_a_line(display):
     shown, written = display
-    with shown.working("compiling [a b]"):
+    with shown.show_status("compiling [a b]"):
         time.sleep(1.3)
         shown.say("note: said meanwhile")
     text = written.getvalue()
@@ -103,7 +103,7 @@ XLA_FLAGS=--xla_dump_to=/tmp/foo and attach the results.
 
 
 def test_xlas_alarms_do_not_reach_the_terminal(capfd):
-    with filtered() as seen:
+    with filter_stderr() as seen:
         os.write(2, f"before\n{ALARM}\nafter\n".encode())
         os.write(2, ALARM.encode())
         os.write(2, b"no end of line")
@@ -112,7 +112,7 @@ def test_xlas_alarms_do_not_reach_the_terminal(capfd):
 
 
 def test_empty_lines_of_others_stay(capfd):
-    with filtered():
+    with filter_stderr():
         os.write(2, b"one\n\ntwo **\n\n")
     assert capfd.readouterr().err == "one\n\ntwo **\n\n"
 
@@ -121,8 +121,8 @@ def test_the_last_words_of_a_process_that_aborts_are_passed_on():
     """All of them: a thread of the process itself would die with some unread."""
     words = b"what was wrong\n" * 4000  # of 15 letters: less than a pipe holds
     program = (
-        "import os\nfrom jaxpg.store.stderr import filtered\n"
-        "with filtered():\n"
+        "import os\nfrom jaxpg.store.stderr import filter_stderr\n"
+        "with filter_stderr():\n"
         "    os.write(2, b'what was wrong\\n' * 4000)\n"
         "    os.abort()\n"
     )
@@ -134,6 +134,6 @@ def test_the_last_words_of_a_process_that_aborts_are_passed_on():
 
 def test_without_a_process_to_filter_it_standard_error_is_as_it_was(monkeypatch, capfd):
     monkeypatch.setattr(stderr.sys, "executable", "/nonexistent/python")
-    with filtered():
+    with filter_stderr():
         os.write(2, ALARM.encode())
     assert capfd.readouterr().err == ALARM

@@ -26,7 +26,7 @@ def test_what_does_not_end_is_named_with_its_stack(capfd):
             time.sleep(0.1)
             error += capfd.readouterr().err
     error += capfd.readouterr().err
-    assert error.startswith("warning: update 1 to 2 has not ended after 0 s: ")
+    assert error.startswith("warning: update 1 to 2 has been running for 0 s: ")
     assert error.count("warning:") == 1
     assert "test_what_does_not_end_is_named_with_its_stack" in error
 
@@ -44,9 +44,9 @@ def test_ten_times_the_usual_is_allowed(monkeypatch):
 
 def test_the_likely_cause_depends_on_jaxlib(monkeypatch):
     monkeypatch.setattr(watchdog.jaxlib, "__version__", "0.10.1")
-    assert "PJRT_NPROC=1 avoids it" in watchdog.likely_cause()
+    assert "PJRT_NPROC=1 avoids it" in watchdog.describe_cause()
     monkeypatch.setattr(watchdog.jaxlib, "__version__", "0.12.0")
-    assert "LAPACK" not in watchdog.likely_cause()
+    assert "LAPACK" not in watchdog.describe_cause()
 
 
 def test_time_in_which_the_process_is_stopped_does_not_count():

@@ -1,4 +1,4 @@
-"""How commands end: mistakes of the user in one clear line each and status 2; mistakes of ours with their traceback."""
+"""How commands end: a user's mistakes give one line each and status 2; our own mistakes give a traceback."""
 
 from __future__ import annotations
 
@@ -16,16 +16,16 @@ from envs.physics import MujocoModelError
 from jaxpg.errors import UserError
 from jaxpg.run.signals import Interrupts
 
-INTERRUPTED = 130  # the exit status, as shells have it
-# What is wrong with a file or a folder of the user's; other OSErrors are mistakes of ours.
-SURROUNDINGS = (errno.EACCES, errno.EPERM, errno.EROFS, errno.ENAMETOOLONG, errno.ELOOP, errno.ENOTDIR, errno.EISDIR)
-SURROUNDINGS += (errno.ENOSPC, errno.EDQUOT, errno.EIO)
+INTERRUPTED = 130  # exit status, as in shells
+# Errors of a file or a folder of the user's; any other OSError is our mistake.
+USER_ERRORS = (errno.EACCES, errno.EPERM, errno.EROFS, errno.ENAMETOOLONG, errno.ELOOP, errno.ENOTDIR, errno.EISDIR)
+USER_ERRORS += (errno.ENOSPC, errno.EDQUOT, errno.EIO)
 
 
 def run_command(main: Callable[[Sequence[str]], int | None]) -> None:
-    """`sys.exit(main(arguments))`, where a user's mistake ends in its message and status 2."""
+    """Runs `sys.exit(main(arguments))`; a user's mistake ends in its message and status 2."""
     interrupted = False
-    with _unbreakable_output():
+    with _redirect_output():
         try:
             with Interrupts():
                 status = main(sys.argv[1:])
@@ -34,15 +34,15 @@ def run_command(main: Callable[[Sequence[str]], int | None]) -> None:
         except (UserError, MujocoModelError) as error:
             status = _report([str(error)])
         except OSError as error:
-            if error.filename is None or error.errno not in SURROUNDINGS:
+            if error.filename is None or error.errno not in USER_ERRORS:
                 raise
             status = _report([f"{os.fsdecode(error.filename)}: {error.strerror}"])
         except KeyboardInterrupt:
             print("interrupted", file=sys.stderr)
             status, interrupted = INTERRUPTED, True
     if interrupted and threading.active_count() > 1:
-        os._exit(status)  # XLA, which compiles there, cannot be interrupted, and Python would wait for its threads
-    gc.freeze()  # the interpreter's last collections would look through all that jax has made: half a second
+        os._exit(status)  # XLA cannot be interrupted while it compiles, and Python would wait for its threads
+    gc.freeze()  # without this, the last garbage collections of the interpreter take half a second
     sys.exit(status)
 
 
@@ -52,12 +52,12 @@ def _report(problems: Sequence[str]) -> int:
     return 2
 
 
-class Unbreakable:
-    """A text stream that goes on in silence when nobody reads it any more, as behind `| head`, or its disk is full.
+class UnbreakableStream:
+    """A text stream that silently drops its output once its reader is gone, as after `| head`, or its disk is full.
 
     Args:
-      stream: where the text goes; what it has no letter for is written as an escape. None goes nowhere.
-      descriptor: of the stream's file; led to the null device when the stream breaks, with all that waits in it.
+      stream: where the text goes; characters that it cannot encode are escaped. None discards everything.
+      descriptor: the stream's file descriptor; redirected to the null device when the stream breaks.
     """
 
     def __init__(self, stream: TextIO | None, descriptor: int):
@@ -86,8 +86,8 @@ class Unbreakable:
 
 
 @contextmanager
-def _unbreakable_output() -> Iterator[None]:
-    out, error = Unbreakable(sys.stdout, 1), Unbreakable(sys.stderr, 2)
+def _redirect_output() -> Iterator[None]:
+    out, error = UnbreakableStream(sys.stdout, 1), UnbreakableStream(sys.stderr, 2)
     with redirect_stdout(out), redirect_stderr(error):
         try:
             yield

@@ -1,4 +1,4 @@
-"""`python -m jaxpg.evaluate run=DIR`: plays a trained policy, deterministically, from fixed starts."""
+"""`python -m jaxpg.evaluate run=DIR`: evaluates a trained policy, deterministically, from fixed starts."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from contextlib import AbstractContextManager, nullcontext
 from typing import TYPE_CHECKING, Any
 
-from jaxpg.commands.options import about_a_run_in
+from jaxpg.commands.options import parse_run_and_env_options
 from jaxpg.config.command_options import EvaluateOptions
 from jaxpg.errors import UserError
 from jaxpg.store import config_file
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
 def main(arguments: Sequence[str]) -> int:
     """The evaluation command; returns its exit status."""
-    options, changes = about_a_run_in("evaluate", EvaluateOptions, arguments)
+    options, changes = parse_run_and_env_options("evaluate", EvaluateOptions, arguments)
     if options is None:
         return 0
     from jaxpg.store import policies
@@ -28,43 +28,43 @@ def main(arguments: Sequence[str]) -> int:
     from jaxpg.watch import episodes
 
     if options.backend == "mujoco":
-        changes |= _in_mujoco(options.run)
+        changes |= _make_mujoco_changes(options.run)
     with physics_cache(options.cache):
         stored = policies.load(options.run, options.checkpoint, options.agent, changes)
-    play = episodes.play_gymnasium if options.backend == "gymnasium" else episodes.play_own
-    with _playing(stored, options.policy) as player, compilation_cache(options.cache, print):
+    play = episodes.play_gymnasium if options.backend == "gymnasium" else episodes.play_native
+    with _choose_player(stored, options.policy) as player, compilation_cache(options.cache, print):
         results = play(player, options.episodes, options.seed)
     how = options.backend if options.policy == "jax" else f"{options.backend}, as {options.policy}"
-    print(f"{stored.config.task}, {stored.agent}, {stored.described(options.checkpoint)}, {how}")
-    for name, value in _rows(results).items():
+    print(f"{stored.config.task}, {stored.agent}, {stored.describe(options.checkpoint)}, {how}")
+    for name, value in _format_results(results).items():
         print(f"{name:<8} {value}")
     if options.json:
-        print(json.dumps(_summary(results), allow_nan=False))
+        print(json.dumps(_summarize(results), allow_nan=False))
     return 0
 
 
-def _rows(results: Results) -> dict[str, str]:
-    """What is to be read, by name; an episode that diverged counts as `jaxpg.store.statistics.counted_returns` says."""
-    number, exploded = len(results.returns), int(results.diverged.sum())
+def _format_results(results: Results) -> dict[str, str]:
+    """The lines to print, by name; for diverged episodes see `jaxpg.store.statistics.penalize_diverged`."""
+    number, num_diverged = len(results.returns), int(results.diverged.sum())
     mean, stderr = _mean(results.returns)
     rows = {"return": f"{mean:.2f} +- {stderr:.2f} (mean and standard error, {number} episodes)"}
-    if exploded == number:
+    if num_diverged == number:
         rows["return"] = f"n/a: the physics of all {number} episodes diverged"
-    elif exploded:
-        rows["diverged"] = f"{exploded} of {number} episodes, each counted as the worst of the others, and as 0 at best"
+    elif num_diverged:
+        rows["diverged"] = f"{num_diverged} of {number} episodes, each counted as the worst of the others, at most 0"
     for name, values in results.metrics.items():
-        rows[name] = _in_words(name, float(finite_mean(values)))
+        rows[name] = _format_metric(name, float(finite_mean(values)))
     return rows
 
 
-def _in_words(name: str, value: float) -> str:
+def _format_metric(name: str, value: float) -> str:
     if not math.isfinite(value):
         return "n/a"
     return f"{value:.2%}" if name == "success" else f"{value:.4g} on average at the end"
 
 
-def _summary(results: Results) -> dict[str, Any]:
-    """The same as numbers, None where there is none."""
+def _summarize(results: Results) -> dict[str, Any]:
+    """The results as numbers; None if there is no such number."""
     mean, stderr = _mean(results.returns)
     success = finite_mean(results.metrics["success"]) if "success" in results.metrics else math.nan
     numbers = {"mean": mean, "stderr": stderr, "success": float(success)}
@@ -73,16 +73,16 @@ def _summary(results: Results) -> dict[str, Any]:
 
 
 def _mean(returns: Any) -> tuple[float, float]:
-    """Mean and standard error; NaN where there is none, the latter of a single episode, too."""
+    """Mean and standard error; the latter is NaN for a single episode."""
     number = len(returns)
     return float(returns.mean()), float(returns.std(ddof=1)) / math.sqrt(number) if number > 1 else math.nan
 
 
-def _in_mujoco(run: str) -> dict[str, str]:
-    """The change to the options of this run by which C MuJoCo steps its environment.
+def _make_mujoco_changes(run: str) -> dict[str, str]:
+    """The changed option with which C MuJoCo steps the run's environment.
 
     Raises:
-      UserError: no run, or its environment is no model that C MuJoCo could step.
+      UserError: there is no run, or C MuJoCo cannot step its environment.
     """
     from jaxpg.store import folder
 
@@ -92,10 +92,10 @@ def _in_mujoco(run: str) -> dict[str, str]:
     return {"env.physics": "mujoco"}
 
 
-def _playing(stored: Any, form: str) -> AbstractContextManager[Any]:
-    """The stored policy as it is, or as exported."""
+def _choose_player(stored: Any, form: str) -> AbstractContextManager[Any]:
+    """The stored policy itself, or its export."""
     if form == "jax":
         return nullcontext(stored)
-    from jaxpg.deploy.export import as_written
+    from jaxpg.deploy.exporter import replace_by_export
 
-    return as_written(stored, form)
+    return replace_by_export(stored, form)

@@ -1,18 +1,18 @@
-"""`python -m jaxpg.export run=DIR`: the controller that a run has learned, for a robot."""
+"""`python -m jaxpg.export run=DIR`: exports a trained policy as a controller for a robot."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 
-from jaxpg.commands.options import about_a_run
+from jaxpg.commands.options import parse_run_options
 from jaxpg.config.command_options import ExportOptions
 
 
 def main(arguments: Sequence[str]) -> int:
     """The export command; returns its exit status."""
-    options = about_a_run("export", ExportOptions, arguments)
+    options = parse_run_options("export", ExportOptions, arguments)
     if options is not None:
-        from jaxpg.deploy import export
+        from jaxpg.deploy import exporter
 
-        export.export(options, print)
+        exporter.export(options, print)
     return 0

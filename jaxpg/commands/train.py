@@ -1,11 +1,11 @@
-"""`python -m jaxpg.train`: trains an agent and leaves a run folder behind; `--help` lists every option."""
+"""`python -m jaxpg.train`: trains an agent and writes a run folder; `--help` lists every option."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 
 import envs
-from jaxpg.commands.options import check_named
+from jaxpg.commands.options import check_option_named
 from jaxpg.config import help, parsing
 
 
@@ -17,14 +17,15 @@ def main(arguments: Sequence[str]) -> int:
     from jaxpg.run import session
     from jaxpg.watch.closing import show_results
 
-    check_named("resume", arguments)
-    given = parsing.parse(arguments)
-    if given.get("resume") == "auto":
-        asked = parsing.compose([text for text in arguments if text != "resume=auto"])
-        return session.begin_or_resume(asked, show_results)
-    if "resume" in given:
-        return session.resume(given, show_results)
-    asked = parsing.compose(arguments)
-    if asked.choices["algo"] not in envs.find(asked.choices["env"]).training:
-        print(f"env={asked.choices['env']} has no training values for algo={asked.choices['algo']}: the defaults apply")
-    return session.begin(asked, show_results)
+    check_option_named("resume", arguments)
+    options = parsing.parse(arguments)
+    if options.get("resume") == "auto":
+        config = parsing.compose([text for text in arguments if text != "resume=auto"])
+        return session.begin_or_resume(config, show_results)
+    if "resume" in options:
+        return session.resume(options, show_results)
+    config = parsing.compose(arguments)
+    if config.choices["algo"] not in envs.find(config.choices["env"]).training:
+        env, algo = config.choices["env"], config.choices["algo"]
+        print(f"env={env} has no training values for algo={algo}: the defaults apply")
+    return session.begin(config, show_results)

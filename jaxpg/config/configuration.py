@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import envs
-from envs.options import OptionError, build, unknown
+from envs.options import OptionError, build, describe_unknown
 from jaxpg.config import conflicts, plain_yaml, registered
 from jaxpg.config import sweep as sweeping
 from jaxpg.config.entries import GROUPS, option_fields
@@ -118,7 +118,9 @@ def divide(values: Mapping[str, Any]) -> tuple[dict[str, Any], dict[str, Any]]:
 
 def check_choices(choices: Mapping[str, Any]) -> None:
     names = {group: str(choice) for group, choice in choices.items()}
-    problems = [unknown(group, name, GROUPS[group]) for group, name in names.items() if name not in GROUPS[group]]
+    problems = [
+        describe_unknown(group, name, GROUPS[group]) for group, name in names.items() if name not in GROUPS[group]
+    ]
     if problems:
         raise OptionError(problems)
     if "env" in names:
@@ -128,7 +130,7 @@ def check_choices(choices: Mapping[str, Any]) -> None:
 def unknown_names(given: Mapping[str, Any], choices: Mapping[str, Any]) -> list[str]:
     """A line for each name that is no option and no group."""
     known = {*option_fields(choices), *GROUPS}
-    return [unknown("option", name, known) for name in given if name not in known]
+    return [describe_unknown("option", name, known) for name in given if name not in known]
 
 
 def to_yaml(config: Config) -> str:

@@ -10,8 +10,8 @@ from collections.abc import Iterator, Mapping
 from typing import Any
 
 import envs
-from envs.hints import python
-from envs.options import OptionError, build, unknown
+from envs.hints import python_command
+from envs.options import OptionError, build, describe_unknown
 from jaxpg.config.entries import GROUPS
 from jaxpg.config.schema import Run
 
@@ -41,7 +41,7 @@ def _problems(name: str, training: Any) -> Iterator[str]:
     schemas = _schemas(name)
     for algo, values in training.items():
         if algo not in GROUPS["algo"]:
-            yield unknown("algo", str(algo), GROUPS["algo"])
+            yield describe_unknown("algo", str(algo), GROUPS["algo"])
         elif not isinstance(values, Mapping):
             yield f"{algo}: expected values by option, such as {{'num_envs': 64}}, not {values!r}"
         else:
@@ -63,9 +63,9 @@ def _schemas(env: str) -> dict[str, dict[str, type]]:
 def _problems_of_value(algo: str, name: Any, value: Any, schemas: Mapping[str, Mapping[str, type]]) -> Iterator[str]:
     if name == "network":
         if value not in GROUPS["network"]:
-            yield unknown("network", str(value), GROUPS["network"])
+            yield describe_unknown("network", str(value), GROUPS["network"])
     elif name not in schemas:
-        yield unknown("option", str(name), [*schemas, "network"])
+        yield describe_unknown("option", str(name), [*schemas, "network"])
     else:
         group, dot, leaf = name.rpartition(".")
         members = schemas[name]
@@ -87,19 +87,19 @@ def program_of(env: str) -> dict[str, str]:
 def command(env: str, verb: str) -> str:
     """How a command about a run of this environment begins, such as `python -m jaxpg.evaluate`."""
     program = program_of(env)
-    return _command(program[PROGRAM], verb) if program else f"{python()} -m jaxpg.{verb}"
+    return _command(program[PROGRAM], verb) if program else f"{python_command()} -m jaxpg.{verb}"
 
 
 def _command(program: str, verb: str) -> str:
-    return f"{python()} {program if program.startswith('-m ') else shlex.quote(program)} {verb}"
+    return f"{python_command()} {program if program.startswith('-m ') else shlex.quote(program)} {verb}"
 
 
 def check_known(env: str, program: str | None) -> None:
     """Raises OptionError where no environment has the name, with the program that registers it, if that is known."""
     if env in envs.REGISTRY:
         return
-    problem = unknown("env", env, envs.REGISTRY).removesuffix("?")
+    problem = describe_unknown("env", env, envs.REGISTRY).removesuffix("?")
     if program is not None:
         problem = f"unknown env '{env}': {program} registers it"
-    instead = f"instead of {python()} -m jaxpg.COMMAND say {_command(program or 'SCRIPT', 'COMMAND')}"
+    instead = f"instead of {python_command()} -m jaxpg.COMMAND say {_command(program or 'SCRIPT', 'COMMAND')}"
     raise OptionError([f"{problem}; {instead}" + ("" if program else ", with the script that registers it")])

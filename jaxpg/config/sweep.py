@@ -11,7 +11,7 @@ import itertools
 from collections.abc import Iterator, Mapping
 from typing import Any
 
-from envs.options import OptionError, build, unknown
+from envs.options import OptionError, build, describe_unknown
 from jaxpg.config.entries import GROUPS, option_fields
 
 PREFIX = "sweep."  # of the option's name, on the command line
@@ -58,7 +58,7 @@ def _problems(name: str, values: Any, choices: Mapping[str, str]) -> Iterator[st
     if name in {*option_fields(choices), *GROUPS} - known.keys():
         yield f"{PREFIX}{name}: {name} cannot be swept, each of its values needs a run of its own"
     elif name not in known:
-        yield unknown("option", PREFIX + name, [PREFIX + other for other in known])
+        yield describe_unknown("option", PREFIX + name, [PREFIX + other for other in known])
     elif not isinstance(values, list):
         yield f"{PREFIX}{name}={values}: expected a list of values, such as [{values},...]"
     elif not values:

@@ -1,1 +1,1 @@
-"""Policies that leave the library: the controller as C, ONNX or StableHLO, each compared with its formula."""
+"""Exports of policies: the controller as C, ONNX or StableHLO, each compared with its formula."""

@@ -1,4 +1,4 @@
-"""A controller in C: its header, examples of its use and their Makefile; written, compiled and run."""
+"""A controller in C: writes its header, examples and their Makefile; compiles and runs the examples."""
 
 from __future__ import annotations
 
@@ -10,16 +10,16 @@ from pathlib import Path
 
 import numpy as np
 
-from jaxpg.deploy import online
+from jaxpg.deploy import c_learner
 from jaxpg.deploy.controller import Controller
-from jaxpg.deploy.header import header, named
-from jaxpg.deploy.sealing import NO_SEAL, sealed
+from jaxpg.deploy.header import make_header, rename
+from jaxpg.deploy.sealing import NO_SEAL, add_seal
 from jaxpg.errors import UserError
 
 FLAGS = ("-std=c99", "-O2", "-Wall", "-Wextra", "-Wpedantic", "-Werror")
 
 EXAMPLE = """\
-/* Reads observations from standard input, number after number; writes a line with the commands of each. */
+/* Reads observations from standard input, number by number; writes a line with the commands for each. */
 #include <stdio.h>
 
 #include "policy.h"
@@ -49,58 +49,61 @@ all: {programs}
 
 
 def write(controller: Controller, folder: Path) -> list[Path]:
-    """Writes NAME.h, an example of each of its uses, and their Makefile into `folder`; returns their paths."""
-    examples = {"main": EXAMPLE} | ({"learn": online.EXAMPLE} if controller.learner else {})
+    """Writes NAME.h, its examples and their Makefile into `folder`; returns their paths."""
+    examples = {"main": EXAMPLE} | ({"learn": c_learner.EXAMPLE} if controller.learner else {})
     makefile = MAKEFILE.format(programs=" ".join(examples), flags=" ".join(FLAGS))
-    texts = {f"{controller.name}.h": header(controller), "Makefile": f"# {NO_SEAL}\n{named(controller, makefile)}"}
-    texts |= {f"{name}.c": f"/* {NO_SEAL} */\n{named(controller, text)}" for name, text in examples.items()}
+    texts = {
+        f"{controller.name}.h": make_header(controller),
+        "Makefile": f"# {NO_SEAL}\n{rename(controller, makefile)}",
+    }
+    texts |= {f"{name}.c": f"/* {NO_SEAL} */\n{rename(controller, text)}" for name, text in examples.items()}
     for file, text in texts.items():
-        (folder / file).write_bytes(sealed(text.encode()))
+        (folder / file).write_bytes(add_seal(text.encode()))
     return [folder / file for file in texts]
 
 
 def load(controller: Controller, folder: Path, double: bool = False) -> Callable[[np.ndarray], np.ndarray]:
-    """The written controller, `[N, n]` to `[N, m]`: its own example, compiled, and run for each array.
+    """The exported controller, `[N, n]` to `[N, m]`: its example, compiled, and run for each array.
 
     Args:
-      controller, folder: as for `write`.
-      double: compute with double in the place of float.
+      controller, folder: as in `write`.
+      double: compute in double instead of float.
 
     Raises:
       UserError: there is no C compiler.
     """
-    return program(controller, folder / "main.c", double)
+    return compile_example(controller, folder / "main.c", double)
 
 
-def program(controller: Controller, source: Path, double: bool = False) -> Callable[[np.ndarray], np.ndarray]:
-    """An example, compiled without a warning: rows of numbers on its standard input to rows on its standard output.
+def compile_example(controller: Controller, source: Path, double: bool = False) -> Callable[[np.ndarray], np.ndarray]:
+    """Compiles an example without warnings; returns a function from its input rows to its output rows.
 
     Raises:
       UserError: there is no C compiler.
     """
-    flags = [*FLAGS, *([named(controller, "-DPOLICY_DOUBLE")] if double else [])]
-    compiled = source.with_suffix("")
-    build = [compiler(), *flags, "-o", str(compiled), str(source), "-lm"]
-    built = subprocess.run(build, capture_output=True, text=True, check=False)
-    if built.returncode:
-        raise RuntimeError(f"{source} does not compile:\n{built.stderr}")
+    flags = [*FLAGS, *([rename(controller, "-DPOLICY_DOUBLE")] if double else [])]
+    executable = source.with_suffix("")
+    command = [find_compiler(), *flags, "-o", str(executable), str(source), "-lm"]
+    result = subprocess.run(command, capture_output=True, text=True, check=False)
+    if result.returncode:
+        raise RuntimeError(f"{source} does not compile:\n{result.stderr}")
 
     def run(rows: np.ndarray) -> np.ndarray:
         lines = "\n".join(" ".join(f"{x:.17g}" for x in row) for row in rows)
-        output = subprocess.run([str(compiled)], input=lines, capture_output=True, text=True, check=True).stdout
+        output = subprocess.run([str(executable)], input=lines, capture_output=True, text=True, check=True).stdout
         return np.array([line.split() for line in output.splitlines()], np.float64)
 
     return run
 
 
-def compiler() -> str:
-    """The C compiler that the variable CC names, or the system's.
+def find_compiler() -> str:
+    """Path of the C compiler: the one that the environment variable CC names, or the system's `cc`.
 
     Raises:
       UserError: there is none.
     """
-    asked = os.environ.get("CC", "cc")
-    found = shutil.which(asked)
-    if found is None:
-        raise UserError(f"format=c is tried out by a C compiler, and there is no {asked}: install gcc, or set CC")
-    return found
+    name = os.environ.get("CC", "cc")
+    path = shutil.which(name)
+    if path is None:
+        raise UserError(f"format=c is tested with a C compiler, and there is no {name}: install gcc, or set CC")
+    return path

@@ -1,12 +1,12 @@
-"""A trained policy as what a robot runs: physical observations in, physical commands out, and nothing of JAX.
+"""A trained policy as a robot runs it: physical observations in, physical commands out, without JAX.
 
     command = limit * clip(squash(f(phi(z))), -1, 1),    z = (s - m) * scale
 
-with the features phi and the network f of the actor, the scale of `jaxpg.normalization`, and squash = tanh or nothing.
-Every format is written from here.
+with the features phi and the network f of the actor, the scale of `jaxpg.normalization`, and squash either tanh or the
+identity. All export formats are written from this form.
 
-An observation is valid if all |z_i| <= `FARTHEST`: none is NaN, infinite, or so large that floats run out of range. Of
-one that is not valid, or whose action is not finite, every command is 0.
+An observation is valid if all |z_i| <= `MAX_DEVIATION`, so none is NaN, infinite, or large enough to overflow. If the
+observation is not valid or the action is not finite, every command is 0.
 """
 
 from __future__ import annotations
@@ -22,16 +22,16 @@ import numpy as np
 from envs.base import Interface
 from jaxpg import normalization
 from jaxpg.config.schema import Linear, Online
-from jaxpg.deploy.names import identifier, printable
+from jaxpg.deploy.identifiers import escape_text, make_identifier
 from jaxpg.errors import UserError
 from jaxpg.evaluation import play
 from jaxpg.program.state import Policy
 from jaxpg.store.policies import StoredPolicy
 
-FARTHEST = 1e6  # deviations from training's mean: beyond, an observation is not valid
-NUM_OBSERVATIONS = 10_000  # on which a controller is tried
+MAX_DEVIATION = 1e6  # standard deviations from training's mean
+NUM_OBSERVATIONS = 10_000  # that an export is tested on
 NUM_EPISODES = 50
-FAR = 10.0
+MAX_PLAYED_DEVIATION = 10.0
 
 
 class Layer(NamedTuple):
@@ -42,13 +42,13 @@ class Layer(NamedTuple):
 
 
 class Learner(NamedTuple):
-    """What a linear-Gaussian controller needs to go on learning as `algo=online` does.
+    """What a linear-Gaussian controller needs to continue learning with `algo=online`.
 
     Attributes:
       value: the critic's layer.
       log_std: log sigma, `[m]`.
-      options: those of the algorithm, `jaxpg.config.schema.Online`.
-      learns_sigma: whether sigma is one of the policy's parameters.
+      options: options of the algorithm.
+      learns_sigma: whether sigma is a parameter of the policy.
     """
 
     value: Layer
@@ -61,15 +61,15 @@ class Controller(NamedTuple):
     """The numbers of a policy, all float32.
 
     Attributes:
-      name: what files and identifiers begin with, such as "pendulum".
+      name: prefix of files and identifiers, such as "pendulum".
       interface: names, units and limits of observations and commands.
       mean, scale: observations enter as (s - mean) * scale, `[n]`.
-      features, order: phi, a name in `jaxpg.program.networks.FEATURES` and its order.
-      layers: of f, with the activation between them.
+      features, order: phi, as a name in `jaxpg.program.networks.FEATURES` and its order.
+      layers: layers of f, with the activation between them.
       activation: a name in `jaxpg.program.networks.ACTIVATIONS`.
-      squash: whether the tanh of the last layer is taken.
-      origin: where it comes from, in words by name.
-      learner: for going on with learning, if it has been trained step by step; else None.
+      squash: whether tanh is applied to the last layer.
+      origin: descriptions of where the policy comes from, by name.
+      learner: state for further learning if the policy was trained step by step, else None.
     """
 
     name: str
@@ -93,24 +93,24 @@ class Controller(NamedTuple):
         return len(self.layers[-1].bias)
 
 
-def controller(stored: StoredPolicy, origin: dict[str, str], name: str | None = None) -> Controller:
-    """The numbers of a stored policy.
+def make_controller(stored: StoredPolicy, origin: dict[str, str], name: str | None = None) -> Controller:
+    """The controller of a stored policy.
 
     Args:
       stored: the policy.
       origin: as in `Controller`.
-      name: as in `Controller`; None makes one of the task's.
+      name: as in `Controller`; None derives it from the task.
 
     Raises:
-      UserError: a number is not finite, the environment names more or fewer numbers than there are, or the name is none
-        that files and identifiers can begin with.
+      UserError: a number is not finite, the environment's interface has the wrong number of entries, or files and
+        identifiers cannot begin with the name.
     """
     config, network = stored.config, stored.config.network
     dense = stored.policy.params["actor"]["params"]["MLP_0"]
     layers = [dense[f"Dense_{i}"] for i in range(len(dense))]
-    made = Controller(
-        name=identifier(config.task) if name is None else _checked_name(name),
-        interface=_plain(stored.interface),
+    controller = Controller(
+        name=make_identifier(config.task) if name is None else _check_name(name),
+        interface=_normalize_interface(stored.interface),
         mean=np.asarray(stored.policy.normalizer.mean),
         scale=np.asarray(normalization.inverse_deviation(stored.policy.normalizer)),
         features=network.features,
@@ -118,43 +118,46 @@ def controller(stored: StoredPolicy, origin: dict[str, str], name: str | None = 
         layers=[Layer(np.asarray(layer["kernel"]), np.asarray(layer["bias"])) for layer in layers],
         activation=network.activation,
         squash=network.squash,
-        origin={key: printable(text) for key, text in origin.items()},
-        learner=_learner(stored),
+        origin={key: escape_text(text) for key, text in origin.items()},
+        learner=_make_learner(stored),
     )
-    _check_numbers(made)
-    return made
+    _check_numbers(controller)
+    return controller
 
 
-def _checked_name(name: str) -> str:
-    if name != identifier(name):
-        raise UserError(f"name={name}: C identifiers and files cannot begin so; name={identifier(name)} is possible")
+def _check_name(name: str) -> str:
+    if name != make_identifier(name):
+        raise UserError(f"name={name}: not a prefix for C identifiers and file names; try name={make_identifier(name)}")
     return name
 
 
-def _plain(interface: Interface) -> Interface:
-    """The same in tuples of printable texts and of floats, whatever the environment has them in."""
+def _normalize_interface(interface: Interface) -> Interface:
+    """The interface as tuples of printable strings and of floats."""
     names, commands, limits = interface
-    texts = (tuple(printable(str(text)) for text in names) for names in (names, commands))
+    texts = (tuple(escape_text(str(text)) for text in names) for names in (names, commands))
     return Interface(*texts, None if limits is None else tuple(float(x) for x in limits))
 
 
-def _check_numbers(made: Controller) -> None:
-    limits = made.interface.limits
+def _check_numbers(controller: Controller) -> None:
+    limits = controller.interface.limits
     sizes = {
-        "interface.observations": (len(made.interface.observations), made.observation_size),
-        "interface.commands": (len(made.interface.commands), made.action_size),
-        "interface.limits": (made.action_size if limits is None else len(limits), made.action_size),
+        "interface.observations": (len(controller.interface.observations), controller.observation_size),
+        "interface.commands": (len(controller.interface.commands), controller.action_size),
+        "interface.limits": (controller.action_size if limits is None else len(limits), controller.action_size),
     }
-    for name, (found, expected) in sizes.items():
-        if found != expected:
-            raise UserError(f"the environment's {name} has {found} entries, and must have {expected}")
-    numbers = {"observation statistics": [made.mean, made.scale], "network": jax.tree.leaves(made.layers)}
+    for name, (size, expected) in sizes.items():
+        if size != expected:
+            raise UserError(f"the environment's {name} has {size} entries, expected {expected}")
+    numbers = {
+        "observation statistics": [controller.mean, controller.scale],
+        "network": jax.tree.leaves(controller.layers),
+    }
     for name, arrays in (numbers | {"limits": [limits or 0.0]}).items():
         if not all(np.all(np.isfinite(array)) for array in arrays):
-            raise UserError(f"the policy cannot leave the library: in its {name} are numbers that are not finite")
+            raise UserError(f"the policy cannot be exported: its {name} contain numbers that are not finite")
 
 
-def _learner(stored: StoredPolicy) -> Learner | None:
+def _make_learner(stored: StoredPolicy) -> Learner | None:
     config, params = stored.config, stored.policy.params
     learns_sigma = config.network.sigma_is == "learned"
     linear = isinstance(config.network, Linear) and config.network.sigma_is in ("fixed", "learned")
@@ -171,72 +174,72 @@ def _learner(stored: StoredPolicy) -> Learner | None:
     )
 
 
-def command_fn(stored: StoredPolicy) -> Callable[[Policy, jax.Array], jax.Array]:
-    """`command(policy, obs)`, `[..., n]` to `[..., m]`, of a policy's parameters: the controller as JAX computes it."""
+def make_command_fn(stored: StoredPolicy) -> Callable[[Policy, jax.Array], jax.Array]:
+    """`command(policy, obs)`, `[..., n]` to `[..., m]`: the controller in JAX, with the parameters as an argument."""
 
     def command(policy, obs):
         action = stored.act(policy, obs)
         z = (obs - policy.normalizer.mean) * normalization.inverse_deviation(policy.normalizer)
-        valid = jnp.all(jnp.abs(z) <= FARTHEST, axis=-1) & jnp.all(jnp.isfinite(action), axis=-1)
-        return jnp.where(valid[..., None], physical(stored.interface, action), 0.0)
+        valid = jnp.all(jnp.abs(z) <= MAX_DEVIATION, axis=-1) & jnp.all(jnp.isfinite(action), axis=-1)
+        return jnp.where(valid[..., None], to_physical(stored.interface, action), 0.0)
 
     return command
 
 
-def commanding(stored: StoredPolicy) -> Callable[[jax.Array], jax.Array]:
-    """`command(obs)`, `[..., n]` to `[..., m]`: as `command_fn`, with the stored parameters."""
-    command = command_fn(stored)
+def make_command(stored: StoredPolicy) -> Callable[[jax.Array], jax.Array]:
+    """`command(obs)`, `[..., n]` to `[..., m]`: `make_command_fn` with the stored parameters."""
+    command = make_command_fn(stored)
     return lambda obs: command(stored.policy, obs)
 
 
-def physical(interface: Interface, action: jax.Array) -> jax.Array:
-    """What an action `[..., m]` commands, in physical units and within the limits."""
+def to_physical(interface: Interface, action: jax.Array) -> jax.Array:
+    """The command for an action `[..., m]`, in physical units and within the limits."""
     limits = interface.limits
     return action if limits is None else jnp.array(limits) * jnp.clip(action, -1.0, 1.0)
 
 
-def observations(stored: StoredPolicy) -> np.ndarray:
-    """What the controller is tried on, `[10000, n]`: what it sees as it plays, and others that are drawn."""
-    seen = played(stored)
-    return np.concatenate([seen, drawn(stored, seen)])
+def collect_observations(stored: StoredPolicy) -> np.ndarray:
+    """Test observations, `[10000, n]`: some from episodes that the controller plays, the others random."""
+    played = play_observations(stored)
+    return np.concatenate([played, draw_observations(stored, played)])
 
 
-def played(stored: StoredPolicy) -> np.ndarray:
-    """What the controller sees in 5,000 steps of its own, `[<= 5000, n]`.
+def play_observations(stored: StoredPolicy) -> np.ndarray:
+    """Observations from 5,000 steps that the controller plays, `[<= 5000, n]`.
 
-    Rows further than `FAR` deviations from training's mean, as a controller plays that diverges, are left out; where
-    training took the observations as they are, rows that are not valid.
+    Rows more than `MAX_PLAYED_DEVIATION` standard deviations from training's mean are left out, as a diverging
+    controller produces them. Without normalization in training, only rows that are not valid are left out.
     """
     length = NUM_OBSERVATIONS // 2 // NUM_EPISODES
     keys = jax.random.split(jax.random.key(0), NUM_EPISODES)
 
     @jax.jit
-    def seen_by(policy):
+    def play_episodes(policy):
         act = functools.partial(stored.act, policy)
         return play(stored.env, act, keys, length, lambda step: (step.before.obs, step.alive))[1]
 
-    obs, alive = (np.asarray(x) for x in seen_by(stored.policy))
-    seen = obs[alive].astype(np.float32)
+    obs, alive = (np.asarray(x) for x in play_episodes(stored.policy))
+    visited = obs[alive].astype(np.float32)
     if not stored.policy.normalizer.count:
-        return seen[np.all(np.abs(seen) <= FARTHEST, axis=1)]
-    mean, deviation = _scatter(stored)
-    last_digits = 1e-6 * np.abs(mean)  # a constant's mean is the constant but for these
-    return seen[np.all(np.abs(seen - mean) <= FAR * deviation + last_digits, axis=1)]
+        return visited[np.all(np.abs(visited) <= MAX_DEVIATION, axis=1)]
+    mean, deviation = _training_statistics(stored)
+    last_digits = 1e-6 * np.abs(mean)  # a constant's mean differs from it by these
+    return visited[np.all(np.abs(visited - mean) <= MAX_PLAYED_DEVIATION * deviation + last_digits, axis=1)]
 
 
-def drawn(stored: StoredPolicy, seen: np.ndarray) -> np.ndarray:
-    """Observations around training's mean, with twice its deviation; with those that were seen they are 10,000.
+def draw_observations(stored: StoredPolicy, played: np.ndarray) -> np.ndarray:
+    """Random observations around training's mean with twice its deviation; as many as complete `played` to 10,000.
 
-    Where training took the observations as they are, around those that were seen, if there are some.
+    Without normalization in training, mean and deviation are those of `played`, unless it is empty.
     """
-    mean, deviation = _scatter(stored)
-    if not stored.policy.normalizer.count and len(seen):
-        mean, deviation = seen.mean(axis=0), seen.std(axis=0)
-    noise = np.asarray(jax.random.normal(jax.random.key(1), (NUM_OBSERVATIONS - len(seen), len(mean))))
+    mean, deviation = _training_statistics(stored)
+    if not stored.policy.normalizer.count and len(played):
+        mean, deviation = played.mean(axis=0), played.std(axis=0)
+    noise = np.asarray(jax.random.normal(jax.random.key(1), (NUM_OBSERVATIONS - len(played), len(mean))))
     return (mean + 2 * deviation * noise).astype(np.float32)
 
 
-def _scatter(stored: StoredPolicy) -> tuple[np.ndarray, np.ndarray]:
-    """Mean and standard deviation of the observations in training."""
+def _training_statistics(stored: StoredPolicy) -> tuple[np.ndarray, np.ndarray]:
+    """Mean and standard deviation of training's observations."""
     normalizer = stored.policy.normalizer
     return np.asarray(normalizer.mean), np.sqrt(np.asarray(normalizer.variance))

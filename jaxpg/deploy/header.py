@@ -1,6 +1,6 @@
-"""The text of a C99 header that is a controller: no allocation, no library but libm, constant weights, re-entrant.
+"""A controller as a C99 header: no allocation, no library but libm, constant weights, re-entrant.
 
-The texts are C as it is written, about a controller called `policy`; `named` gives it its own name.
+The templates are C code for a controller called `policy`; `rename` puts in the real name.
 """
 
 from __future__ import annotations
@@ -10,14 +10,14 @@ import re
 
 import numpy as np
 
-from jaxpg.deploy import online
-from jaxpg.deploy.controller import FARTHEST, Controller
-from jaxpg.deploy.names import in_comment
+from jaxpg.deploy import c_learner
+from jaxpg.deploy.controller import MAX_DEVIATION, Controller
+from jaxpg.deploy.identifiers import escape_comment
 from jaxpg.deploy.sealing import NO_SEAL
 from jaxpg.features import BOUND, monomials
 from jaxpg.program.networks import NUM_FEATURES
 
-# Included twice it is there once; another controller of the same name is an error, not left out in silence.
+# Including it twice is fine; including another controller of the same name is an error.
 GUARDED = """\
 #ifdef JAXPG_POLICY_H
 #ifndef JAXPG_POLICY_{digest}
@@ -35,7 +35,7 @@ HEADER = """
 #include <stdint.h>
 #include <string.h>
 
-/* Numbers are float; where POLICY_DOUBLE is defined they are double. */
+/* Numbers are float, or double if POLICY_DOUBLE is defined. */
 #ifdef POLICY_DOUBLE
 typedef double policy_real;
 typedef uint64_t policy_bits;
@@ -50,7 +50,7 @@ typedef uint32_t policy_bits;
 #define POLICY_COMMANDS {commands}
 
 {arrays}
-/* y = W' x + b, with the weights in the order of their use. */
+/* y = W' x + b, with the weights in the order in which they are used. */
 static inline void policy_layer(const policy_real *weight, const policy_real *bias, int inputs, int outputs,
                                 const policy_real *x, policy_real *y) {{
     for (int j = 0; j < outputs; j++) y[j] = bias[j];
@@ -58,7 +58,7 @@ static inline void policy_layer(const policy_real *weight, const policy_real *bi
         for (int j = 0; j < outputs; j++) y[j] += weight[i * outputs + j] * x[i];
 }}
 
-/* Whether |x| <= bound, by their bits: with -ffast-math a comparison of numbers takes for granted that none is NaN. */
+/* Whether |x| <= bound, compared by bits: with -ffast-math, compilers assume that no number is NaN. */
 static inline int policy_within(policy_real x, policy_real bound) {{
     policy_bits bits, most;
     memcpy(&bits, &x, sizeof bits);
@@ -68,7 +68,7 @@ static inline int policy_within(policy_real x, policy_real bound) {{
 
 static inline int policy_finite(policy_real x) {{ return policy_within(x, (policy_real)3.4028234663852886e38); }}
 
-/* What the first layer sees of an observation: {size} numbers. Returns whether it is valid. */
+/* The first layer's {size} inputs for an observation. Returns whether it is valid. */
 static inline int policy_features(const policy_real *observation, policy_real *x) {{
     policy_real z[POLICY_OBSERVATIONS];
     int valid = 1;
@@ -85,7 +85,7 @@ static inline int policy_no_command(policy_real *command) {{
     return 0;
 }}
 
-/* Commands of the last layer's numbers. */
+/* Commands for the last layer's outputs. */
 static inline int policy_limited(const policy_real *u, policy_real *command) {{
     int valid = 1;
     for (int i = 0; i < POLICY_COMMANDS; i++) {{
@@ -97,7 +97,7 @@ static inline int policy_limited(const policy_real *u, policy_real *command) {{
 }}
 
 /* The command for an observation, both in the units above. Returns 1; or 0, with every command 0, if the observation is
-   not valid: if a number of it is NaN, infinite, or over a million deviations from training's mean. */
+   not valid: one of its numbers is NaN, infinite, or over a million standard deviations from training's mean. */
 static inline int policy_command(const policy_real observation[POLICY_OBSERVATIONS],
                                  policy_real command[POLICY_COMMANDS]) {{
     policy_real x[{width}], y[{width}];
@@ -107,7 +107,7 @@ static inline int policy_command(const policy_real observation[POLICY_OBSERVATIO
 }}
 {more}"""
 
-# Statements that make x of z, by the name of the features.
+# Statements that compute x from z, by name of the features.
 FEATURES = {
     "identity": """\
     for (int i = 0; i < {size}; i++) x[i] = z[i];
@@ -144,7 +144,7 @@ FEATURES = {
 """,
 }
 
-# Each hands a NaN on.
+# Each propagates NaN.
 ACTIVATIONS = {
     "tanh": "POLICY_F(tanh)(y[i])",
     "relu": "y[i] < 0 ? 0 : y[i]",
@@ -153,34 +153,34 @@ ACTIVATIONS = {
 }
 
 
-def header(controller: Controller) -> str:
+def make_header(controller: Controller) -> str:
     """The text of the header."""
     limits = controller.interface.limits
     code = HEADER.format(
         size=_num_features(controller),
         observations=controller.observation_size,
         commands=controller.action_size,
-        arrays="\n".join(_arrays(controller)),
+        arrays="\n".join(_make_arrays(controller)),
         width=max(max(layer.weight.shape) for layer in controller.layers),
-        features=_features(controller),
-        layers=_layers(controller),
+        features=_make_features(controller),
+        layers=_make_layers(controller),
         action="POLICY_F(tanh)(u[i])" if controller.squash else "u[i]",
-        more=online.code(controller) if controller.learner else "",
-        farthest=FARTHEST,
+        more=c_learner.make_code(controller) if controller.learner else "",
+        farthest=MAX_DEVIATION,
         command="a" if limits is None else "policy_limit[i] * (a > 1 ? 1 : a < -1 ? -1 : a)",
     )
     digest = hashlib.sha256(code.encode()).hexdigest()[:16]
-    return "\n".join([*_about(controller), named(controller, GUARDED.format(digest=digest, code=code))])
+    return "\n".join([*_describe(controller), rename(controller, GUARDED.format(digest=digest, code=code))])
 
 
-def named(controller: Controller, text: str) -> str:
-    """C about a controller called `policy`, about this one."""
-    own = {"policy": controller.name, "POLICY": controller.name.upper()}
-    return re.sub("policy|POLICY", lambda found: own[found[0]], text)
+def rename(controller: Controller, text: str) -> str:
+    """C code for a controller called `policy`, with this controller's name instead."""
+    names = {"policy": controller.name, "POLICY": controller.name.upper()}
+    return re.sub("policy|POLICY", lambda match: names[match[0]], text)
 
 
-def _about(controller: Controller) -> list[str]:
-    """What a reader has to know."""
+def _describe(controller: Controller) -> list[str]:
+    """The comment at the top: origin, observations and commands."""
     names, commands, limits = controller.interface
     bounds = [""] * len(commands) if limits is None else [f", at most {x:g} either way" for x in limits]
     lines = [f"{name}: {text}" for name, text in controller.origin.items()]
@@ -190,47 +190,49 @@ def _about(controller: Controller) -> list[str]:
         f"/* {NO_SEAL}",
         " * A controller trained by jaxpg.",
         " *",
-        *(f" * {in_comment(x)}".rstrip() for x in lines),
+        *(f" * {escape_comment(x)}".rstrip() for x in lines),
         " */",
     ]
 
 
-def _arrays(controller: Controller) -> list[str]:
+def _make_arrays(controller: Controller) -> list[str]:
     """The constants."""
     arrays = {"mean": controller.mean, "scale": controller.scale}
     for i, layer in enumerate(controller.layers):
         arrays |= {f"weight_{i}": layer.weight, f"bias_{i}": layer.bias}
     if controller.interface.limits is not None:
         arrays["limit"] = np.array(controller.interface.limits, np.float32)
-    texts = [_array("policy_real", name, [_literal(x) for x in np.ravel(x)]) for name, x in arrays.items()]
     if controller.learner:
-        arrays = online.arrays(controller.learner)
-        texts += [_array("policy_real", name, [_literal(x) for x in np.ravel(x)]) for name, x in arrays.items()]
+        arrays |= c_learner.make_arrays(controller.learner)
+    texts = [
+        _format_array("policy_real", name, [_format_literal(x) for x in np.ravel(array)])
+        for name, array in arrays.items()
+    ]
     if controller.features == "polynomial":
-        factors = _factors(controller.observation_size, controller.order)
-        texts.append(_array("unsigned short", "factors", [str(x) for pair in factors for x in pair]))
+        factors = _find_factors(controller.observation_size, controller.order)
+        texts.append(_format_array("unsigned short", "factors", [str(x) for pair in factors for x in pair]))
     return texts
 
 
-def _array(kind: str, name: str, numbers: list[str]) -> str:
+def _format_array(kind: str, name: str, numbers: list[str]) -> str:
     rows = [", ".join(numbers[i : i + 8]) for i in range(0, len(numbers), 8)]
     return f"static const {kind} policy_{name}[{len(numbers)}] = {{\n    " + ",\n    ".join(rows) + "};\n"
 
 
-def _literal(x: np.floating) -> str:
+def _format_literal(x: np.floating) -> str:
     """All digits of a float32 or a float64."""
     text = f"{x:.9g}" if x.dtype == np.float32 else f"{x:.17g}"
     text = text if set(".e") & set(text) else f"{text}.0"
     return f"{text}f" if x.dtype == np.float32 else text
 
 
-def _factors(size: int, order: int) -> list[tuple[int, int]]:
-    """Of each monomial the one without its last factor, and that factor; (0, 0) for those of degree 1."""
+def _find_factors(size: int, order: int) -> list[tuple[int, int]]:
+    """For each monomial, the monomial without its last factor, and that factor; (0, 0) for degree 1."""
     place = {c: i for i, c in enumerate(monomials(size, order))}
     return [(place[c[:-1]], c[-1]) if len(c) > 1 else (0, 0) for c in place]
 
 
-def _features(controller: Controller) -> str:
+def _make_features(controller: Controller) -> str:
     numbers = {
         "size": _num_features(controller),
         "order": controller.order,
@@ -244,7 +246,7 @@ def _num_features(controller: Controller) -> int:
     return NUM_FEATURES[controller.features](controller.observation_size, controller.order)
 
 
-def _layers(controller: Controller) -> str:
+def _make_layers(controller: Controller) -> str:
     lines = []
     for i, layer in enumerate(controller.layers):
         inputs, outputs = layer.weight.shape

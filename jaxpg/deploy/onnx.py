@@ -1,6 +1,6 @@
 """A controller as an ONNX model: `observation` `[batch, n]` to `command` `[batch, m]`, for any batch.
 
-The commands of a row are 0 where its observation is not valid, as `jaxpg.deploy.controller` has it.
+The commands of a row are 0 if its observation is not valid, as in `jaxpg.deploy.controller`.
 """
 
 from __future__ import annotations
@@ -12,17 +12,17 @@ from typing import Any
 
 import numpy as np
 
-from jaxpg.deploy.controller import FARTHEST, Controller
-from jaxpg.deploy.sealing import NO_SEAL, sealed
+from jaxpg.deploy.controller import MAX_DEVIATION, Controller
+from jaxpg.deploy.sealing import NO_SEAL, add_seal
 from jaxpg.features import BOUND
 
-OPSET = 18  # of 2022: what runtimes of robots have learned since then
-IR_VERSION = 8  # which goes with it
+OPSET = 18  # from 2022: common runtimes support it
+IR_VERSION = 8  # the one that belongs to it
 FLOAT = 1  # onnx.TensorProto.FLOAT
 
 
 class Graph:
-    """The nodes and constants of a model while it is written; a value is its name."""
+    """The nodes and constants of a model under construction; values are referred to by name."""
 
     def __init__(self, helper: Any, numpy_helper: Any):
         self._helper, self._numpy_helper = helper, numpy_helper
@@ -49,25 +49,30 @@ def write(controller: Controller, folder: Path) -> list[Path]:
     from onnx import TensorProto, checker, helper, numpy_helper
 
     graph = Graph(helper, numpy_helper)
-    _command(graph, controller)
+    _add_command(graph, controller)
     values = [
         helper.make_tensor_value_info(name, TensorProto.FLOAT, ["batch", size])
         for name, size in (("observation", controller.observation_size), ("command", controller.action_size))
     ]
-    made = helper.make_graph(graph.nodes, controller.name, values[:1], values[1:], graph.constants)
-    model = helper.make_model(made, opset_imports=[helper.make_opsetid("", OPSET)], producer_name="jaxpg")
+    body = helper.make_graph(graph.nodes, controller.name, values[:1], values[1:], graph.constants)
+    model = helper.make_model(body, opset_imports=[helper.make_opsetid("", OPSET)], producer_name="jaxpg")
     model.ir_version = IR_VERSION
     names, commands, limits = controller.interface
-    about = {"observations": "; ".join(names), "commands": "; ".join(commands), "limits": str(limits), "seal": NO_SEAL}
-    helper.set_model_props(model, controller.origin | about)
+    metadata = {
+        "observations": "; ".join(names),
+        "commands": "; ".join(commands),
+        "limits": str(limits),
+        "seal": NO_SEAL,
+    }
+    helper.set_model_props(model, controller.origin | metadata)
     checker.check_model(model, full_check=True)
     path = folder / f"{controller.name}.onnx"
-    path.write_bytes(sealed(model.SerializeToString()))
+    path.write_bytes(add_seal(model.SerializeToString()))
     return [path]
 
 
 def load(controller: Controller, folder: Path) -> Callable[[np.ndarray], np.ndarray]:
-    """The written controller, `[N, n]` to `[N, m]`, in onnxruntime."""
+    """The exported controller, `[N, n]` to `[N, m]`, in onnxruntime."""
     import onnxruntime
 
     path = str(folder / f"{controller.name}.onnx")
@@ -75,45 +80,45 @@ def load(controller: Controller, folder: Path) -> Callable[[np.ndarray], np.ndar
     return lambda obs: session.run(["command"], {"observation": obs})[0]
 
 
-def _command(graph: Graph, controller: Controller) -> None:
+def _add_command(graph: Graph, controller: Controller) -> None:
     centred = graph.node("Sub", "observation", graph.constant(controller.mean))
     z = graph.node("Mul", centred, graph.constant(controller.scale))
     x = FEATURES[controller.features](graph, z, controller)
     for layer in controller.layers[:-1]:
-        x = ACTIVATIONS[controller.activation](graph, _layer(graph, x, layer))
-    action = _layer(graph, x, controller.layers[-1])
+        x = ACTIVATIONS[controller.activation](graph, _add_layer(graph, x, layer))
+    action = _add_layer(graph, x, controller.layers[-1])
     if controller.squash:
         action = graph.node("Tanh", action)
-    limited = action if controller.interface.limits is None else _limited(graph, action, controller.interface.limits)
-    valid = graph.node("And", _within(graph, z, FARTHEST), _within(graph, action, np.finfo(np.float32).max))
+    limited = action if controller.interface.limits is None else _clip(graph, action, controller.interface.limits)
+    valid = graph.node("And", _is_within(graph, z, MAX_DEVIATION), _is_within(graph, action, np.finfo(np.float32).max))
     graph.node("Where", valid, limited, graph.constant(0), name="command")
 
 
-def _limited(graph: Graph, action: str, limits: tuple[float, ...]) -> str:
+def _clip(graph: Graph, action: str, limits: tuple[float, ...]) -> str:
     return graph.node("Mul", graph.node("Clip", action, graph.constant(-1), graph.constant(1)), graph.constant(limits))
 
 
-def _within(graph: Graph, x: str, bound: float) -> str:
-    """Whether all |x| of a row are at most this, `[batch, 1]`; NaN is not."""
-    each = graph.node("LessOrEqual", graph.node("Abs", x), graph.constant(bound))
-    least = graph.node("ReduceMin", graph.node("Cast", each, to=FLOAT), graph.constant([1], np.int64), keepdims=1)
-    return graph.node("Greater", least, graph.constant(0.5))
+def _is_within(graph: Graph, x: str, bound: float) -> str:
+    """Whether all |x| of a row are at most `bound`, `[batch, 1]`; false for NaN."""
+    small = graph.node("LessOrEqual", graph.node("Abs", x), graph.constant(bound))
+    smallest = graph.node("ReduceMin", graph.node("Cast", small, to=FLOAT), graph.constant([1], np.int64), keepdims=1)
+    return graph.node("Greater", smallest, graph.constant(0.5))
 
 
-def _layer(graph: Graph, x: str, layer: Any) -> str:
+def _add_layer(graph: Graph, x: str, layer: Any) -> str:
     return graph.node("Gemm", x, graph.constant(layer.weight), graph.constant(layer.bias))
 
 
 def _polynomial(graph: Graph, z: str, controller: Controller) -> str:
-    size, before = controller.observation_size, [(i,) for i in range(controller.observation_size)]
+    size, terms = controller.observation_size, [(i,) for i in range(controller.observation_size)]
     degrees = [z]
     for degree in range(2, controller.order + 1):
-        place, before = (
-            {c: i for i, c in enumerate(before)},
+        place, terms = (
+            {c: i for i, c in enumerate(terms)},
             [*itertools.combinations_with_replacement(range(size), degree)],
         )
-        rest = graph.columns(degrees[-1], [place[c[:-1]] for c in before])
-        degrees.append(graph.node("Mul", rest, graph.columns(z, [c[-1] for c in before])))
+        rest = graph.columns(degrees[-1], [place[c[:-1]] for c in terms])
+        degrees.append(graph.node("Mul", rest, graph.columns(z, [c[-1] for c in terms])))
     return graph.node("Concat", *degrees, axis=1)
 
 
@@ -132,13 +137,15 @@ def _radial(graph: Graph, z: str, controller: Controller) -> str:
     axis, width = np.linspace(-BOUND, BOUND, order), 2 * BOUND / (order - 1)
     bumps = None
     for i in range(controller.observation_size):
-        away = graph.node("Div", graph.node("Sub", graph.columns(z, [i]), graph.constant(axis)), graph.constant(width))
-        energy = graph.node("Mul", graph.node("Mul", away, away), graph.constant(-0.5))
-        own = graph.node("Softmax", energy, axis=1)
+        distance = graph.node(
+            "Div", graph.node("Sub", graph.columns(z, [i]), graph.constant(axis)), graph.constant(width)
+        )
+        energy = graph.node("Mul", graph.node("Mul", distance, distance), graph.constant(-0.5))
+        bump = graph.node("Softmax", energy, axis=1)
         if bumps is None:
-            bumps = own
+            bumps = bump
             continue
-        one, two = (graph.node("Unsqueeze", x, graph.constant([axis], np.int64)) for x, axis in ((bumps, 2), (own, 1)))
+        one, two = (graph.node("Unsqueeze", x, graph.constant([axis], np.int64)) for x, axis in ((bumps, 2), (bump, 1)))
         bumps = graph.node("Reshape", graph.node("Mul", one, two), graph.constant([-1, order ** (i + 1)], np.int64))
     return bumps
 

@@ -1,4 +1,4 @@
-"""The formula of a controller in numpy: what every written format, and JAX itself, is measured by."""
+"""The formula of a controller in numpy: the reference for every exported format and for JAX itself."""
 
 from __future__ import annotations
 
@@ -7,50 +7,52 @@ import math
 
 import numpy as np
 
-from jaxpg.deploy.controller import FARTHEST, Controller
+from jaxpg.deploy.controller import MAX_DEVIATION, Controller
 from jaxpg.features import BOUND, monomials
 
-ROWS = 500  # computed at once: an observation may have ten thousand features
+ROWS = 500  # per batch: an observation may have ten thousand features
 
 
-def commands(controller: Controller, obs: np.ndarray, dtype: type = np.float64, stretch: float = 1.0) -> np.ndarray:
-    """`[N, n]` to `[N, m]`, every operation in this precision.
+def compute_commands(
+    controller: Controller, obs: np.ndarray, dtype: type = np.float64, stretch: float = 1.0
+) -> np.ndarray:
+    """The commands `[N, m]` for observations `[N, n]`, with every operation in `dtype`.
 
         command = limit * clip(squash(f(phi(z))), -1, 1),    z = (s - m) * scale
 
-    and 0 where a |z_i| is not within `FARTHEST` or a number of the last layer is not finite.
+    and 0 where some |z_i| exceeds `MAX_DEVIATION` or an output of the last layer is not finite.
 
     Args:
-      controller: its numbers, float32.
-      obs: s.
-      dtype: of the arithmetic.
-      stretch: z is multiplied by it: to see how much depends on its last digits.
+      controller: the controller, in float32.
+      obs: observations s.
+      dtype: precision of the arithmetic.
+      stretch: factor on z, to measure the sensitivity to its last digits.
     """
     parts = np.array_split(obs, max(len(obs) // ROWS, 1))
-    return np.concatenate([_commands(controller, part, dtype, stretch) for part in parts])
+    return np.concatenate([_compute_rows(controller, part, dtype, stretch) for part in parts])
 
 
-def _commands(controller: Controller, obs: np.ndarray, dtype: type, stretch: float) -> np.ndarray:
-    with np.errstate(all="ignore"):  # what is not finite is looked for at the end
+def _compute_rows(controller: Controller, obs: np.ndarray, dtype: type, stretch: float) -> np.ndarray:
+    with np.errstate(all="ignore"):  # non-finite values are handled at the end
         z = (obs.astype(dtype) - controller.mean.astype(dtype)) * controller.scale.astype(dtype) * dtype(stretch)
         x = FEATURES[controller.features](z, controller.order)
         for layer in controller.layers[:-1]:
-            x = ACTIVATIONS[controller.activation](_affine(layer, x))
-        action = _affine(controller.layers[-1], x)
+            x = ACTIVATIONS[controller.activation](_apply_layer(layer, x))
+        action = _apply_layer(controller.layers[-1], x)
         action = np.tanh(action) if controller.squash else action
-        valid = np.all(np.abs(z) <= FARTHEST, axis=1) & np.all(np.isfinite(action), axis=1)
+        valid = np.all(np.abs(z) <= MAX_DEVIATION, axis=1) & np.all(np.isfinite(action), axis=1)
     limits = controller.interface.limits
     bounded = action if limits is None else np.array(limits, dtype) * np.clip(action, -1, 1)
     return np.where(valid[:, None], bounded, 0)
 
 
-def units(controller: Controller, exact: np.ndarray) -> tuple[np.ndarray, str]:
-    """What errors of each command are counted in, `[m]`, with its name.
+def error_units(controller: Controller, exact: np.ndarray) -> tuple[np.ndarray, str]:
+    """The unit of each command's error, `[m]`, and its name.
 
-    The limit; where there is none, 1 for a squashed action, which stays within it; else the largest of the commands.
+    The limit if there is one; otherwise 1 for a squashed action, else the largest command.
 
     Args:
-      controller: for its limits.
+      controller: has the limits.
       exact: commands, `[N, m]`.
     """
     if controller.interface.limits is not None:
@@ -60,33 +62,34 @@ def units(controller: Controller, exact: np.ndarray) -> tuple[np.ndarray, str]:
     return np.max(np.abs(exact), axis=0), "the largest command"
 
 
-def largest_error(found: np.ndarray, exact: np.ndarray, unit: np.ndarray) -> float:
-    """max |found - exact| / unit, over `[N, m]`; NaN if there is one. A unit of 0 allows no difference.
+def largest_error(commands: np.ndarray, exact: np.ndarray, unit: np.ndarray) -> float:
+    """max |commands - exact| / unit over `[N, m]`; NaN if any is. With unit 0 any difference is infinite.
 
     >>> largest_error(np.array([[999.0]]), np.array([[1000.0]]), np.array([1000.0]))
     0.001
     """
-    difference = np.abs(np.asarray(found, np.float64) - exact)
-    apart = np.where(difference == 0, 0, np.inf)
-    return float(np.max(np.divide(difference, unit, out=apart, where=np.broadcast_to(unit > 0, apart.shape))))
+    difference = np.abs(np.asarray(commands, np.float64) - exact)
+    error = np.where(difference == 0, 0, np.inf)
+    return float(np.max(np.divide(difference, unit, out=error, where=np.broadcast_to(unit > 0, error.shape))))
 
 
-def rounding(controller: Controller, obs: np.ndarray, exact: np.ndarray) -> float:
-    """How far float arithmetic moves the commands at most, in `units`: a measure of how steep the network is.
+def rounding_error(controller: Controller, obs: np.ndarray, exact: np.ndarray) -> float:
+    """The largest rounding error of the commands, in `error_units`: it measures how steep the network is.
 
-    The larger of two: the formula in float32, and the formula in float64 at z changed in the last digit of a float32.
+    The larger of two errors: of the formula in float32, and of the formula in float64 with z changed by one float32
+    epsilon.
 
     Args:
-      controller, obs: as for `commands`.
+      controller, obs: as in `compute_commands`.
       exact: commands in float64.
     """
     epsilon = float(np.finfo(np.float32).eps)
-    moved = [commands(controller, obs, np.float32)]
-    moved += [commands(controller, obs, stretch=1 + sign * epsilon) for sign in (-1, 1)]
-    return max(largest_error(command, exact, units(controller, exact)[0]) for command in moved)
+    perturbed = [compute_commands(controller, obs, np.float32)]
+    perturbed += [compute_commands(controller, obs, stretch=1 + sign * epsilon) for sign in (-1, 1)]
+    return max(largest_error(command, exact, error_units(controller, exact)[0]) for command in perturbed)
 
 
-def _affine(layer, x: np.ndarray) -> np.ndarray:
+def _apply_layer(layer, x: np.ndarray) -> np.ndarray:
     return x @ layer.weight.astype(x.dtype) + layer.bias.astype(x.dtype)
 
 

@@ -1,7 +1,7 @@
-"""Files that are put into a folder of the user's, and are known again there.
+"""Exported files carry a seal, so that a later export can recognise and replace them.
 
-Each holds a seal, `jaxpg:` and a digest of everything else in the file: in a comment, or among what a format keeps
-about itself. A file whose seal is right is as an export left it, and another export may replace it.
+A seal is `jaxpg:` and a digest of the rest of the file, in a comment or in the format's metadata. A file with a correct
+seal is unchanged since it was exported, so another export may replace it.
 """
 
 from __future__ import annotations
@@ -16,46 +16,46 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 from jaxpg.errors import UserError
-from jaxpg.store.files import opened, read, through
+from jaxpg.store.files import descriptor_path, open_folder, read
 
 NO_SEAL = "jaxpg:" + 16 * "0"
 SEAL = re.compile(rb"jaxpg:[0-9a-f]{16}")
 
 
-def sealed(content: bytes) -> bytes:
-    """The content of a file with its seal where `NO_SEAL` stood.
+def add_seal(content: bytes) -> bytes:
+    """The content of a file with `NO_SEAL` replaced by its seal.
 
-    >>> is_sealed(sealed(f"/* {NO_SEAL} */".encode()))
+    >>> is_sealed(add_seal(f"/* {NO_SEAL} */".encode()))
     True
     """
-    return content.replace(NO_SEAL.encode(), _seal(content))
+    return content.replace(NO_SEAL.encode(), _make_seal(content))
 
 
 def is_sealed(content: bytes) -> bool:
-    """Whether the content is what `sealed` gave, in every byte."""
-    return set(SEAL.findall(content)) == {_seal(SEAL.sub(NO_SEAL.encode(), content))}
+    """Whether the content is exactly what `add_seal` returned."""
+    return set(SEAL.findall(content)) == {_make_seal(SEAL.sub(NO_SEAL.encode(), content))}
 
 
-def _seal(content: bytes) -> bytes:
+def _make_seal(content: bytes) -> bytes:
     return b"jaxpg:" + hashlib.sha256(content).hexdigest()[:16].encode()
 
 
 def check_replaceable(names: Sequence[str], out: Path) -> None:
-    """Looks for files of the user's where others are to be written.
+    """Checks that an export would overwrite no file of the user's.
 
     Args:
-      names: of files.
-      out: the folder, which need not be there.
+      names: names of the files.
+      out: the folder, which need not exist.
 
     Raises:
-      UserError: under one of the names there is something else than a sealed file: the user's own or changed file, a
-        link, a folder.
+      UserError: one of the names belongs to anything but a sealed file: a file of the user's, a changed file, a link or
+        a folder.
     """
-    theirs = [name for name in names if not _is_free(out / name)]
-    if theirs:
+    occupied = [name for name in names if not _is_free(out / name)]
+    if occupied:
         raise UserError(
-            f"out={out} holds {', '.join(theirs)}, not written by an export, or changed since: nothing is written; "
-            f"take another out=DIR, or overwrite=true"
+            f"out={out} holds {', '.join(occupied)}, not written by an export or changed since: nothing is written; "
+            f"choose another out=DIR, or overwrite=true"
         )
 
 
@@ -64,33 +64,33 @@ def _is_free(path: Path) -> bool:
         return is_sealed(read(path))
     except FileNotFoundError:
         return not os.path.lexists(path)
-    except OSError:  # it cannot be read, or is no file of its own
+    except OSError:  # unreadable, or not a regular file
         return False
 
 
 def check_folder(out: Path) -> None:
-    """Raises UserError where there can be no such folder to write into: a file is there, or a link in a run folder."""
+    """Raises UserError if the folder cannot be used: a file has its name, or it is a link in a run folder."""
     if out.exists() and not out.is_dir():
-        raise UserError(f"out={out}: there is a file of that name")
-    with _reported(out), contextlib.suppress(FileNotFoundError), opened(out):
+        raise UserError(f"out={out}: a file has that name")
+    with _report_errors(out), contextlib.suppress(FileNotFoundError), open_folder(out):
         pass
 
 
-def move(paths: Sequence[Path], out: Path) -> None:
-    """Puts the files into the folder, made where there is none, in the place of files or links of the same names.
+def move_into(paths: Sequence[Path], out: Path) -> None:
+    """Moves the files into the folder, which is created if needed, replacing files or links of the same names.
 
-    They are renamed once all of them are there whole. A link is replaced, not followed; one in the place of the folder
-    is refused in a run folder.
+    The files are renamed only once all of them are complete. Links are replaced, not followed. Inside a run folder, a
+    link in place of the folder is refused.
 
     Raises:
-      UserError: it cannot be written, or one of the names is a folder's.
+      UserError: the folder cannot be written, or one of the names belongs to a folder.
     """
     folders = [path.name for path in paths if (out / path.name).is_dir() and not (out / path.name).is_symlink()]
     if folders:
-        raise UserError(f"out={out}: {', '.join(folders)} there is a folder")
-    with _reported(out):
+        raise UserError(f"out={out}: {', '.join(folders)} is a folder there")
+    with _report_errors(out):
         out.parent.mkdir(parents=True, exist_ok=True)
-        with opened(out, make=True) as folder, _folder_in(folder, out) as place:
+        with open_folder(out, make=True) as folder, _make_folder(folder, out) as place:
             for path in paths:
                 shutil.copyfile(path, place / path.name)
             for path in paths:
@@ -98,13 +98,13 @@ def move(paths: Sequence[Path], out: Path) -> None:
 
 
 @contextlib.contextmanager
-def _folder_in(folder: int, out: Path) -> Iterator[Path]:
-    with tempfile.TemporaryDirectory(dir=through(folder, out), prefix=".export-") as place:
+def _make_folder(folder: int, out: Path) -> Iterator[Path]:
+    with tempfile.TemporaryDirectory(dir=descriptor_path(folder, out), prefix=".export-") as place:
         yield Path(place)
 
 
 @contextlib.contextmanager
-def _reported(out: Path) -> Iterator[None]:
+def _report_errors(out: Path) -> Iterator[None]:
     try:
         yield
     except OSError as error:

@@ -14,7 +14,7 @@ MAX_FEATURES = 10_000  # a grid over many observations is soon beyond any memory
 
 def make_env(config: Config) -> Any:
     """The environment; raises OptionError where it has a mistake to report, or where the features do not fit it."""
-    env = envs.of_config(config.choices["env"], config.env)
+    env = envs.make_from_config(config.choices["env"], config.env)
     _check_features(config.network, env.observation_size)
     return env
 

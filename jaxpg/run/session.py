@@ -1,4 +1,4 @@
-"""A training run from beginning to end: how it begins or goes on, and with what status it ends."""
+"""A training run from beginning to end: how it begins or resumes, and its exit status."""
 
 from __future__ import annotations
 
@@ -22,27 +22,27 @@ from jaxpg.program.compile import Program, compile_program
 from jaxpg.program.environment import make_env
 from jaxpg.program.schedule import described_jump, plan
 from jaxpg.program.state import RunState
-from jaxpg.run.loop import Loop, Session, is_solved, updates_made
+from jaxpg.run.loop import Loop, Session, count_updates, is_solved
 from jaxpg.run.signals import StopRequests
 from jaxpg.run.terminal import Display
 from jaxpg.store import config_file, folder, lock, results, same_run, versions
 from jaxpg.store.cache import compilation_cache, physics_cache, timed
 from jaxpg.store.folder import RunFolder
-from jaxpg.store.lines import up_to
+from jaxpg.store.lines import select_until
 from jaxpg.store.loggers import follower
 from jaxpg.types import TrainState
 
-# Slow to import and not needed before training: imported while XLA compiles.
-NEEDED_LATER = ("jaxpg.store.checkpoint", "tensorboardX", "matplotlib.figure", "matplotlib.backends.backend_agg")
-EXPLODED = 4  # the exit status of a run that ended because its numbers were not finite
-NOT_SAVED = 5  # the exit status of a run whose last state is on no disk
+# Slow to import and only needed after compilation, so they are imported while XLA compiles.
+LATE_MODULES = ("jaxpg.store.checkpoint", "tensorboardX", "matplotlib.figure", "matplotlib.backends.backend_agg")
+DIVERGED_STATUS = 4  # exit status of a run that ended because its numbers were not finite
+NOT_SAVED_STATUS = 5  # exit status of a run whose last state could not be saved
 
 
 class Times(NamedTuple):
-    """What a training took.
+    """How long training took.
 
     Attributes:
-      rate: environment steps per second, of all agents.
+      rate: environment steps per second, over all agents.
       compiling, training: seconds.
     """
 
@@ -51,7 +51,7 @@ class Times(NamedTuple):
     training: float
 
 
-# What is done with a run that has ended well, while its folder is still owned; without times it had ended before.
+# Called with a run that has ended well, while its folder is still locked; times are None if it had ended before.
 Finish = Callable[[Session, Times | None], None]
 
 
@@ -59,18 +59,18 @@ def begin(config: Config, finish: Finish, check: Callable[[RunFolder], None] = f
     """Trains from the beginning; returns the exit status.
 
     Args:
-      config: of the run.
+      config: configuration of the run.
       finish: called with a run that has ended with status 0.
-      check: raises UserError where the folder holds what must not be overwritten.
+      check: raises UserError if the folder holds something that must not be overwritten.
     """
     prepare(config)
-    follower.check(config.run.loggers)
-    env = _env(config)  # before anything is written: it may have a mistake to report
-    run_folder = folder.planned(config)
+    follower.check_installed(config.run.loggers)
+    env = _make_env(config)  # before anything is written, as it may raise an error
+    run_folder = folder.choose(config)
     lock.check_free(run_folder.path)
     check(run_folder)
-    with folder.owned(run_folder, print):
-        check(run_folder)  # another process may have been there just now
+    with folder.own(run_folder, print):
+        check(run_folder)  # again, now that the folder is locked
         return _begin(config, finish, env, run_folder)
 
 
@@ -91,7 +91,7 @@ def _begin(config: Config, finish: Finish, env: Any, run_folder: RunFolder) -> i
 
 
 def _check_start(obs: np.ndarray, env: Any) -> None:
-    """Raises UserError where an observation of the first episodes, `[S, N, n]`, is one of a physics that diverged."""
+    """Raises UserError if an initial observation, `[S, N, n]`, is in the range that counts as diverged."""
     outside = ~(np.abs(obs) <= BOUND)
     if outside.any():
         place = int(np.argmax(outside.any(axis=(0, 1))))
@@ -100,100 +100,98 @@ def _check_start(obs: np.ndarray, env: Any) -> None:
         size = obs[..., place][outside[..., place]][0]
         raise UserError(
             f"observation {place}{name} is {size:.3g} after a reset: numbers that are not finite or beyond {BOUND:.0e} "
-            f"count as diverged; give it in units in which it is smaller"
+            f"count as diverged; choose units in which it is smaller"
         )
 
 
 def resume(given: Mapping[str, Any], finish: Finish) -> int:
-    """Goes on from the newest checkpoint of the run in `given["resume"]`; returns the exit status."""
+    """Resumes the run in `given["resume"]` from its newest checkpoint; returns the exit status."""
     changes = {name: value for name, value in given.items() if name != "resume"}
     run_folder = folder.find(str(given["resume"]))
-    with folder.owned(run_folder, print):
+    with folder.own(run_folder, print):
         stored = config_file.load(run_folder.config)
         config = configuration.change(stored, changes)
         same_run.check_options(run_folder, stored, config)
-        return _go_on(stored, config, finish, run_folder)
+        return _continue(stored, config, finish, run_folder)
 
 
 def begin_or_resume(config: Config, finish: Finish) -> int:
-    """Goes on with the run in `run_dir` where there is something to resume, and else begins it; the exit status.
+    """Resumes the run in `run_dir` if it has a checkpoint, else begins it; returns the exit status.
 
     Args:
-      config: all options of the run, as for a new one.
+      config: all options of the run, as for a new run.
     """
     if config.run.run_dir is None:
         raise UserError("resume=auto needs run_dir=DIR: the folder to begin in, or to resume from")
-    run_folder = folder.planned(config)
+    run_folder = folder.choose(config)
     if not folder.has_checkpoints(run_folder):
         return begin(config, finish, folder.check_nothing_to_lose)
-    with folder.owned(run_folder, print):
+    with folder.own(run_folder, print):
         stored = config_file.load(run_folder.config)
-        # The folder may have been moved, or be given in other words.
+        # The folder may have been moved, or its path may be written differently.
         config = dataclasses.replace(config, run=dataclasses.replace(config.run, run_dir=stored.run.run_dir))
         same_run.check_options(run_folder, stored, config)
-        return _go_on(stored, config, finish, run_folder)
+        return _continue(stored, config, finish, run_folder)
 
 
-def _go_on(stored: Config, config: Config, finish: Finish, run_folder: RunFolder) -> int:
+def _continue(stored: Config, config: Config, finish: Finish, run_folder: RunFolder) -> int:
     from jaxpg.store.checkpoint import Checkpoints
 
-    recorded = folder.read_versions(run_folder)
-    follower.check(config.run.loggers)
-    prepare(config, recorded.get("threads"))  # before orbax restores anything, which starts the backend as well
+    recorded_versions = folder.read_versions(run_folder)
+    follower.check_installed(config.run.loggers)
+    prepare(config, recorded_versions.get("threads"))  # before orbax, which starts the backend too
     checkpoints = Checkpoints(run_folder.checkpoints)
     if checkpoints.latest() is None:
-        raise UserError(
-            f"{run_folder.path} has no checkpoint yet: begin again in another run_dir, or here with resume=auto"
-        )
+        raise UserError(f"{run_folder.path} has no checkpoint yet: start in another run_dir, or here with resume=auto")
     update, problems = checkpoints.newest_sound()
     same_run.check_checkpoint(checkpoints, update, config)
     schedule = plan(config)
     display = Display(schedule.total_steps, update * schedule.steps_per_update, config.num_agents)
     for problem in problems:
-        display.say(f"note: {problem}; the one before it is used")
+        display.say(f"note: {problem}; using the one before it")
     session = Session(config, schedule, run_folder, display)
-    if _is_over(session, update):
+    if _report_if_finished(session, update):
         finish(session, None)
         return 0
-    now = versions.versions()
-    changed = versions.changes(recorded, now)
-    _say_what_goes_on(session, update, described_jump(stored, config, update), changed)
-    program, seconds = _compile(session, _env(config), resumed=True)
+    current_versions = versions.collect_versions()
+    changes = versions.find_changes(recorded_versions, current_versions)
+    _announce_resume(session, update, described_jump(stored, config, update), changes)
+    program, seconds = _compile(session, _make_env(config), resumed=True)
     state = checkpoints.restore(update, program.state_shape)
     if config.run.nan_policy == "skip":
-        state = state._replace(train=_side_by_side(state.train))
+        state = state._replace(train=_align_updates(state.train))
     folder.replace(run_folder.config, configuration.to_yaml(config))
-    if changed:
-        folder.change_versions(run_folder, recorded, now)
+    if changes:
+        folder.change_versions(run_folder, recorded_versions, current_versions)
     return _train(session, finish, program, state, seconds)
 
 
-def _is_over(session: Session, update: int) -> bool:
-    """Whether nothing is left to do after `update` updates, which is said then."""
+def _report_if_finished(session: Session, update: int) -> bool:
+    """Whether nothing is left to do after `update` updates; if so, tells the user."""
     config, schedule, run_folder, display = session
     if update >= schedule.num_updates:
-        display.say(f"{run_folder.path} is finished; a larger total_steps goes on")
+        display.say(f"{run_folder.path} is finished; a larger total_steps continues it")
         return True
-    lines = up_to(folder.read_metrics(run_folder, config.num_agents), update)
+    lines = select_until(folder.read_metrics(run_folder, config.num_agents), update)
     solved = is_solved(config.run, results.best_returns(lines))
     if solved:
-        display.say(f"{run_folder.path} has reached stop_return={config.run.stop_return:g}; a higher one goes on")
+        display.say(f"{run_folder.path} has reached stop_return={config.run.stop_return:g}; a higher one continues it")
     return solved
 
 
-def _say_what_goes_on(session: Session, update: int, jump: str | None, changed: Mapping[str, tuple[Any, Any]]) -> None:
-    """From where, and what is not as it was: schedules that jump, and versions."""
+def _announce_resume(session: Session, update: int, jump: str | None, changes: Mapping[str, tuple[Any, Any]]) -> None:
+    """Tells where the run resumes, and what has changed: schedules that jump, and versions."""
     schedule, say = session.schedule, session.display.say
     steps = update * schedule.steps_per_update
     say(f"resuming {session.run_folder.path} at {steps:,} of {schedule.total_steps:,} steps")
     if jump:
         say(f"note: {jump}")
-    for change in changed.items():
-        say(f"note: {versions.described(*change)}")
+    for change in changes.items():
+        say(f"note: {versions.describe_change(*change)}")
 
 
-def _env(config: Config) -> Any:
-    """The environment of a run that fits into memory."""
+def _make_env(config: Config) -> Any:
+    """The environment, after checking that the run fits into memory."""
     with physics_cache(config.run.cache):
         env = make_env(config)
     memory.check(config, env)
@@ -201,35 +199,35 @@ def _env(config: Config) -> Any:
 
 
 def _compile(session: Session, env: Any, resumed: bool = False) -> tuple[Program, float]:
-    """The compiled program, and the seconds that it took."""
+    """The compiled program, and the seconds of compilation."""
     config, display, began = session.config, session.display, time.monotonic()
     what = f"{config.choices['algo']} on {config.task}, network={config.choices['network']}"
     name = f"{what} {config.num_shards} {config.run.vmap_seeds} {resumed}"
     with (
         timed(config.run.cache, name) as before,
-        display.working(f"compiling {what} ({before})"),
+        display.show_status(f"compiling {what} ({before})"),
         compilation_cache(config.run.cache, display.say),
     ):
-        program = compile_program(config, env, session.schedule.chunk, resumed=resumed, meanwhile=_import_the_rest)
+        program = compile_program(config, env, session.schedule.chunk, resumed=resumed, meanwhile=_import_late_modules)
     seconds = time.monotonic() - began
     display.say(f"compiled in {seconds:.1f} s")
     return program, seconds
 
 
-def _import_the_rest() -> None:
-    for name in NEEDED_LATER:
+def _import_late_modules() -> None:
+    for name in LATE_MODULES:
         importlib.import_module(name)
 
 
 def _train(session: Session, finish: Finish, program: Program, state: RunState, compile_seconds: float) -> int:
-    """Until the last update or a request to stop; returns the exit status."""
+    """Trains until the last update or a request to stop; returns the exit status."""
     loop = Loop(session, program, state)
     try:
         with StopRequests() as stop:
             loop.run(stop)
     finally:
         seconds = loop.close()
-    status, text = _ending(session, loop, stop.signal)
+    status, text = _describe_end(session, loop, stop.signal)
     if text:
         session.display.say(text)
     if status:
@@ -239,24 +237,25 @@ def _train(session: Session, finish: Finish, program: Program, state: RunState, 
     return 0
 
 
-def _ending(session: Session, loop: Loop, stopped: Signals | None) -> tuple[int, str | None]:
-    """The exit status of a run that has ended, and what is to be said of it."""
-    run, watch, update = session.config.run, loop.watch, loop.update
+def _describe_end(session: Session, loop: Loop, stopped: Signals | None) -> tuple[int, str | None]:
+    """The exit status of a run that has ended, and a message for the user."""
+    run, monitor, update = session.config.run, loop.monitor, loop.update
     steps, again = f"{update * session.schedule.steps_per_update:,} steps", f"resume={session.run_folder.path}"
-    if watch.nobody_goes_on:
-        advice = f"{again} nan_policy=skip leaves it out"
+    if monitor.is_stuck:
+        advice = f"{again} nan_policy=skip skips it"
         if run.nan_policy == "skip":
-            advice = f"the last {watch.in_a_row:,} updates could not be applied; {again} tries further ones"
-        return EXPLODED, f"error: {watch.problem}; stopped at {steps}; {advice}"
+            advice = f"the last {monitor.consecutive:,} updates could not be applied; {again} tries further ones"
+        return DIVERGED_STATUS, f"error: {monitor.problem}; stopped at {steps}; {advice}"
     if loop.keeper.failed:
-        return NOT_SAVED, f"error: the last state, at {steps}, could not be saved; {again} repeats what is lost"
+        text = f"error: the last state, at {steps}, could not be saved; {again} repeats the lost updates"
+        return NOT_SAVED_STATUS, text
     if loop.solved:
         return 0, f"reached stop_return={run.stop_return:g} after {steps}"
     if stopped and update < session.schedule.num_updates:
-        return 128 + stopped, f"{stopped.name}: stopped at {steps}; {again} goes on"
+        return 128 + stopped, f"{stopped.name}: stopped at {steps}; {again} continues"
     return 0, None
 
 
-def _side_by_side(train: TrainState) -> TrainState:
-    """Agents that have stood still go on with the others: the updates that they have missed count as left out."""
-    return train._replace(update=np.full_like(train.update, updates_made(train)))
+def _align_updates(train: TrainState) -> TrainState:
+    """Lets agents that were stuck continue with the others: the updates that they missed count as skipped."""
+    return train._replace(update=np.full_like(train.update, count_updates(train)))

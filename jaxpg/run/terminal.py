@@ -1,4 +1,4 @@
-"""What a person sees while a run goes on: a progress bar on a terminal, plain lines elsewhere."""
+"""The display of a run: a progress bar on a terminal, plain lines elsewhere."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from rich.progress import (
 
 
 class Display:
-    """Progress of a run of `total_steps` environment steps of each of its agents, `steps` of which are done."""
+    """Progress of a run: each agent takes `total_steps` environment steps, and has taken `steps` of them."""
 
     def __init__(self, total_steps: int, steps: int = 0, num_agents: int = 1):
         self.console = Console(highlight=False, soft_wrap=True)
@@ -36,8 +36,8 @@ class Display:
         self.console.print(text, markup=False)
 
     @contextmanager
-    def working(self, text: str) -> Iterator[None]:
-        """Says what is being done inside: with a clock that runs on a terminal, in a line elsewhere."""
+    def show_status(self, text: str) -> Iterator[None]:
+        """Shows what the block is doing: with a running clock on a terminal, as a line elsewhere."""
         if not self.console.is_terminal:
             self.say(f"{text} ...")
             yield
@@ -48,37 +48,37 @@ class Display:
             yield
 
     def start(self) -> None:
-        """Training begins now."""
+        """Starts the clock and the progress bar."""
         self._began = time.monotonic()
         if self._bar:
             self._bar.start()
 
     def update(self, line: dict[str, Any]) -> None:
-        """Shows a line of metrics: on a terminal each on the bar, and those with an evaluation as text that stays."""
+        """Shows a line of metrics on the progress bar; one with an evaluation is also printed."""
         seconds = time.monotonic() - self._began
         rate = (line["steps"] - self._first_steps) / max(seconds, 1e-9)
-        text = f"{rate * self._num_agents:,.0f} steps/s  return {shown(line.get('return'))}"
+        text = f"{rate * self._num_agents:,.0f} steps/s  return {format_metric(line.get('return'))}"
         if self._bar:
             self._bar.update(self._task, completed=line["steps"], description=text)
         if "eval_return" in line:
             left = (self._total - line["steps"]) / rate
             self.say(
                 f"{line['steps'] / self._total:4.0%}  {line['steps']:>12,} steps  {text}  "
-                f"deterministic {shown(line['eval_return'])}  {left:.0f} s left"
+                f"deterministic {format_metric(line['eval_return'])}  {left:.0f} s left"
             )
 
     def stop(self) -> None:
         if self._bar:
             self._bar.stop()
 
-    def table(self, rows: dict[str, str]) -> None:
+    def show_table(self, rows: dict[str, str]) -> None:
         """The short table at the end."""
         width = max(map(len, rows)) + 2
         for name, value in rows.items():
             self.say(f"{name:<{width}}{value}")
 
 
-def shown(value: Any) -> str:
-    """A metric for people: the mean where there are several agents, n/a where there is none yet."""
+def format_metric(value: Any) -> str:
+    """A metric as text: the mean over several agents; n/a if there is no value yet."""
     numbers = [x for x in (value if isinstance(value, list) else [value]) if x is not None]
     return f"{sum(numbers) / len(numbers):.1f}" if numbers else "n/a"

@@ -33,7 +33,7 @@ from jax.experimental.compilation_cache import compilation_cache as jax_cache
 
 from envs.physics import storage
 from jaxpg.program.backend import num_threads
-from jaxpg.store.stderr import filtered
+from jaxpg.store.stderr import filter_stderr
 
 MAX_AGE = 30 * 24 * 3600.0  # seconds; an older entry is removed, and compiled anew when it is needed
 MAX_BYTES = 64 * 2**20  # of all entries together: every start reads those of its folder. A training takes half a MB.
@@ -71,7 +71,7 @@ def compilation_cache(enabled: bool, say: Callable[[str], None]) -> Iterator[Non
 
 def _cached(enabled: bool, say: Callable[[str], None]) -> Iterator[None]:
     if not enabled or jax.config.jax_compilation_cache_dir is not None:
-        with filtered():
+        with filter_stderr():
             yield
         return
     try:
@@ -79,7 +79,7 @@ def _cached(enabled: bool, say: Callable[[str], None]) -> Iterator[None]:
         staging = store.stage()
     except (CacheError, OSError) as error:
         say(f"note: no compilation cache: {error}")
-        with filtered():
+        with filter_stderr():
             yield
         return
     with staging:
@@ -87,7 +87,7 @@ def _cached(enabled: bool, say: Callable[[str], None]) -> Iterator[None]:
 
 
 def _compile_in(store: Store, staging: Path, say: Callable[[str], None]) -> Iterator[None]:
-    with warnings.catch_warnings(record=True) as caught, filtered() as seen:
+    with warnings.catch_warnings(record=True) as caught, filter_stderr() as seen:
         warnings.simplefilter("always")
         with _jax_cache_in(staging):
             yield

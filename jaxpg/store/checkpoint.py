@@ -27,7 +27,7 @@ from orbax import checkpoint as ocp
 
 from jaxpg.errors import UserError
 from jaxpg.store import files
-from jaxpg.store.leaves import described, digest, from_storage, kinds_of, name_of, on_host, stored_as
+from jaxpg.store.leaves import describe, digest, from_storage, leaf_name, recorded_shapes, storage_shape, to_host
 from jaxpg.types import PyTree
 
 
@@ -86,9 +86,9 @@ class Checkpoints:
           OSError: it cannot be made or opened, or has links in it, through which orbax would write and delete.
         """
         _silence_what_is_left_behind()
-        descriptor = files.open_folder(self.folder, make=not self._read_only)
+        descriptor = files.open_folder_descriptor(self.folder, make=not self._read_only)
         self._closing = weakref.finalize(self, os.close, descriptor)
-        self._descriptor, self._place = descriptor, files.through(descriptor, self.folder)
+        self._descriptor, self._place = descriptor, files.descriptor_path(descriptor, self.folder)
         if not self._read_only:
             files.check_no_links(descriptor)
         self._manager = self._managed()
@@ -125,9 +125,9 @@ class Checkpoints:
         Raises:
           SaveError: it cannot be written; nothing is left of it. RuntimeError: orbax declines.
         """
-        leaves = on_host(tree)
+        leaves = to_host(tree)
         content = {name: leaf for name, leaf in leaves.items() if leaf.size}  # orbax refuses empty arrays
-        record = {"step": step, "meta": dict(meta), "leaves": {name: described(leaf) for name, leaf in leaves.items()}}
+        record = {"step": step, "meta": dict(meta), "leaves": {name: describe(leaf) for name, leaf in leaves.items()}}
         record["sha256"] = digest(record)
         arguments = ocp.args.Composite(state=ocp.args.StandardSave(content), meta=ocp.args.JsonSave(record))
         with self._writing(step):
@@ -185,9 +185,9 @@ class Checkpoints:
 
     def _is_there(self) -> bool:
         """Whether the open folder is the one that has the name now, which is made where there is none."""
-        with files.opened(self.folder, make=True) as now:
+        with files.open_folder(self.folder, make=True) as now:
             same = os.path.sameopenfile(now, self._descriptor)
-        return same and self._place == files.through(self._descriptor, self.folder)
+        return same and self._place == files.descriptor_path(self._descriptor, self.folder)
 
     def _remove_unfinished(self) -> None:
         """What a failed save has left: it takes space."""
@@ -202,7 +202,7 @@ class Checkpoints:
         """
         record = self._read(step, meta=ocp.args.JsonRestore())["meta"]
         try:
-            kinds_of(record["leaves"])
+            recorded_shapes(record["leaves"])
             found = {name: record[name] for name in ("step", "meta", "leaves")}
         except (TypeError, ValueError, KeyError, AttributeError) as error:  # JSON all the same, after a flipped bit
             problem = f"{self.folder / str(step)}: damaged, its record is not one of ours ({_reason(error)})"
@@ -221,14 +221,14 @@ class Checkpoints:
         if record["step"] != step:
             raise CheckpointError(f"{self.folder / str(step)}: damaged, it is what was saved as {record['step']}")
         recorded = record["leaves"]
-        kinds = kinds_of(recorded)
+        kinds = recorded_shapes(recorded)
         stored = {name: kind for name, kind in kinds.items() if kind.size}
         restored = self._read(step, state=ocp.args.StandardRestore(stored))["state"]
         leaves = {
             name: np.asarray(restored.get(name, np.zeros(kind.shape, kind.dtype))) for name, kind in kinds.items()
         }
         for name, leaf in leaves.items():
-            if described(leaf) != recorded[name]:
+            if describe(leaf) != recorded[name]:
                 raise CheckpointError(f"{self.folder / str(step)}: damaged, {name} differs from what was saved")
         return leaves
 
@@ -244,7 +244,7 @@ class Checkpoints:
           CheckpointError: it cannot be read, was made by another program, or its content is damaged.
         """
         paths, structure = jax.tree_util.tree_flatten_with_path(template)
-        expected = {f"{part}/{name_of(path)}".lstrip("/"): leaf for path, leaf in paths}
+        expected = {f"{part}/{leaf_name(path)}".lstrip("/"): leaf for path, leaf in paths}
         recorded = self.record(step)["leaves"]
         wanted = {name: leaf for name, leaf in recorded.items() if name in expected or not part}
         self._check_same_program(step, wanted, expected)
@@ -267,7 +267,7 @@ class Checkpoints:
                 f"{self.folder / str(step)}: made by another program: {names[0]} is in only one of them"
             )
         for name, leaf in expected.items():
-            ours, saved = stored_as(leaf), recorded[name]
+            ours, saved = storage_shape(leaf), recorded[name]
             if [list(ours.shape), str(ours.dtype)] != saved[:2]:
                 raise CheckpointError(
                     f"{self.folder / str(step)}: made by another program: {name} is {saved[1]}{saved[0]} there, "
@@ -289,7 +289,7 @@ def _check_own(folder: Path) -> None:
     for path in (folder, *folder.rglob("*")):
         mode = path.lstat().st_mode
         if not stat.S_ISREG(mode) and not stat.S_ISDIR(mode):
-            raise OSError(errno.ELOOP, f"{path.name}: {files.A_LINK if stat.S_ISLNK(mode) else 'it is no file'}")
+            raise OSError(errno.ELOOP, f"{path.name}: {files.LINK_REFUSED if stat.S_ISLNK(mode) else 'it is no file'}")
 
 
 def _to_disk(folder: Path) -> None:

@@ -16,6 +16,6 @@ def load(path: Path) -> Config:
     """
     try:
         text = files.read(path).decode()
-    except (OSError, ValueError) as error:  # the latter where it is no UTF-8, or the path no path
+    except (OSError, ValueError) as error:  # ValueError: not UTF-8, or an invalid path
         raise not_a_configuration(str(path), error) from error
     return from_yaml(text, str(path))

@@ -1,7 +1,7 @@
-"""Files in folders whose content may be somebody else's: read and written where they are meant, and nowhere else.
+"""Reads and writes files in folders that others may have changed, without being led elsewhere.
 
-A folder that is owned is held by a descriptor: what is read or written in it goes there, wherever it has been moved
-and whatever has taken its name since. Links inside a run folder are never followed: it may have come from anywhere.
+A locked run folder is kept open: files are read and written there even if it has been moved or its name now belongs to
+another folder. Links inside a run folder are never followed, as the folder may have come from anywhere.
 """
 
 from __future__ import annotations
@@ -15,21 +15,21 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import BinaryIO
 
-UNFINISHED = ".unfinished"  # ends the name of a file that is renamed once it is complete
-FOLDER = os.O_RDONLY | getattr(os, "O_DIRECTORY", 0)  # Windows, where no run is, has none
-A_LINK = "it is a link, and what is in a run folder must be its own"
-DESCRIPTORS = "/proc/self/fd"  # on Linux a path to each that is open
-NO_FILE = (errno.EINVAL, errno.ELOOP)  # of what is found where a file was expected
+UNFINISHED = ".unfinished"  # ending of a file that is renamed once it is complete
+FOLDER = os.O_RDONLY | getattr(os, "O_DIRECTORY", 0)  # missing on Windows, where nothing is trained
+LINK_REFUSED = "it is a link, and a run folder must not contain links"
+DESCRIPTORS = "/proc/self/fd"  # on Linux, has a path to each open descriptor
+NOT_A_FILE = (errno.EINVAL, errno.ELOOP)  # errors for anything else where a file was expected
 
-_owned: dict[Path, int] = {}  # the folders that this process owns, by the names that they were given
+_locked_folders: dict[Path, int] = {}  # folders locked by this process, by their original paths
 
 
 def replace(path: Path, content: bytes) -> None:
-    """Writes a file that others, and who comes after a kill or a power failure, see as it was or whole.
+    """Replaces a file atomically: readers, also after a kill or a power failure, see it either old or complete.
 
-    A link of that name is replaced, and what it leads to stays as it is. Raises OSError.
+    A link of that name is replaced, and its target left alone. Raises OSError.
     """
-    with opened(path.parent) as folder:
+    with open_folder(path.parent) as folder:
         _replace(folder, path.name, content)
 
 
@@ -49,54 +49,54 @@ def _replace(folder: int, name: str, content: bytes) -> None:
 
 
 def read(path: Path) -> bytes:
-    """The content of a file; raises OSError, also where that is a link in a run folder, a folder or a device."""
-    with opened_in(path, os.O_RDONLY) as file:
+    """The content of a file; raises OSError, also for a folder, a device, or a link in a run folder."""
+    with open_file(path, os.O_RDONLY) as file:
         return file.read()
 
 
 @contextlib.contextmanager
-def opened_in(path: Path, flags: int) -> Iterator[BinaryIO]:
-    """A file, open for what the flags of `os.open` say, inside; raises OSError as `read`."""
+def open_file(path: Path, flags: int) -> Iterator[BinaryIO]:
+    """Opens a file in the block, with flags as for `os.open`; raises OSError as `read` does."""
     mode = {os.O_RDONLY: "rb", os.O_WRONLY: "wb", os.O_RDWR: "r+b"}[flags & os.O_ACCMODE]
-    with opened(path.parent) as folder, os.fdopen(open_in(folder, path.name, flags), mode) as file:
+    with open_folder(path.parent) as folder, os.fdopen(open_at(folder, path.name, flags), mode) as file:
         yield file
 
 
-def open_in(folder: int, name: str, flags: int) -> int:
-    """A descriptor of the file of this name in an open folder; raises OSError for what is no file of its own."""
+def open_at(folder: int, name: str, flags: int) -> int:
+    """A descriptor of the file of this name in an open folder; raises OSError unless it is a regular file."""
     try:
-        descriptor = _open(name, flags | os.O_NONBLOCK, folder)  # or a pipe would wait for somebody to write
+        descriptor = _open(name, flags | os.O_NONBLOCK, folder)  # or opening a pipe would wait for a writer
     except IsADirectoryError:
-        raise OSError(errno.EINVAL, "it is no file") from None
+        raise OSError(errno.EINVAL, "it is not a file") from None
     mode = os.fstat(descriptor).st_mode
     if not stat.S_ISREG(mode):
         os.close(descriptor)
-        raise OSError(errno.EINVAL, "it is no file")
+        raise OSError(errno.EINVAL, "it is not a file")
     return descriptor
 
 
 @contextlib.contextmanager
-def opened(folder: Path, make: bool = False) -> Iterator[int]:
-    """A descriptor of a folder, inside.
+def open_folder(folder: Path, make: bool = False) -> Iterator[int]:
+    """Opens a folder in the block; yields its descriptor.
 
     Args:
-      folder: any; links that lead to it are followed, but none inside a run folder.
-      make: where there is none; not those above it.
+      folder: any folder; links on the way to it are followed, except inside a run folder.
+      make: create the folder, but not its parents, if it does not exist.
 
     Raises:
-      OSError: there is none, or there is a link on the way to it inside a run folder.
+      OSError: there is no such folder, or a link on the way to it inside a run folder.
     """
-    descriptor = open_folder(folder, make)
+    descriptor = open_folder_descriptor(folder, make)
     try:
         yield descriptor
     finally:
         os.close(descriptor)
 
 
-def open_folder(folder: Path, make: bool = False) -> int:
-    """As `opened`; to be closed."""
+def open_folder_descriptor(folder: Path, make: bool = False) -> int:
+    """As `open_folder`; the caller closes the descriptor."""
     name = Path(os.path.abspath(folder))
-    for root, owner in tuple(_owned.items()):  # other threads may begin and end runs meanwhile
+    for root, owner in tuple(_locked_folders.items()):  # other threads may begin and end runs at the same time
         if name.is_relative_to(root):
             return _open_below(owner, name.relative_to(root).parts, make)
     run = next((above for above in name.parents if _is_run(above)), None)
@@ -116,17 +116,17 @@ def _is_run(folder: Path) -> bool:
 
 
 def _open_below(root: int, names: Sequence[str], make: bool) -> int:
-    """A folder below that of a run, by way of folders that are no links; the last one is made if need be."""
+    """Opens a folder below a run folder without following links; creates the last one if `make`."""
     descriptor = os.dup(root)
     for place, name in enumerate(names, 1):
         try:
             if make and place == len(names):
                 with contextlib.suppress(FileExistsError):
                     os.mkdir(name, dir_fd=descriptor)
-            below = _open(name, FOLDER, descriptor)
+            child = _open(name, FOLDER, descriptor)
         finally:
             os.close(descriptor)
-        descriptor = below
+        descriptor = child
     return descriptor
 
 
@@ -135,12 +135,12 @@ def _open(name: str, flags: int, parent: int | None) -> int:
         return os.open(name, flags | os.O_NOFOLLOW, 0o666, dir_fd=parent)
     except OSError:
         if is_link(name, parent):
-            raise OSError(errno.ELOOP, A_LINK) from None
+            raise OSError(errno.ELOOP, LINK_REFUSED) from None
         raise
 
 
 def is_link(name: str, parent: int | None) -> bool:
-    """Whether there is a link of this name."""
+    """Whether the name belongs to a link."""
     try:
         return stat.S_ISLNK(os.stat(name, dir_fd=parent, follow_symlinks=False).st_mode)
     except OSError:
@@ -148,29 +148,29 @@ def is_link(name: str, parent: int | None) -> bool:
 
 
 def check_no_links(folder: int) -> None:
-    """Raises OSError, which names it, where there is a link in an open folder."""
+    """Raises OSError, naming the link, if there is one in an open folder."""
     for name in sorted(os.listdir(folder)):
         if is_link(name, folder):
-            raise OSError(errno.ELOOP, f"{name}: {A_LINK}")
+            raise OSError(errno.ELOOP, f"{name}: {LINK_REFUSED}")
 
 
 @contextlib.contextmanager
-def owned(path: Path, descriptor: int) -> Iterator[None]:
-    """Whatever is read or written below `path` inside is in the open folder `descriptor`."""
+def redirect(path: Path, descriptor: int) -> Iterator[None]:
+    """In the block, everything below `path` is read and written in the open folder `descriptor`."""
     name = Path(os.path.abspath(path))
-    _owned[name] = descriptor
+    _locked_folders[name] = descriptor
     try:
         yield
     finally:
-        del _owned[name]
+        del _locked_folders[name]
 
 
-def whereabouts(path: Path) -> Path:
-    """The name that an owned folder has now, for it may have been moved; of any other the given one."""
-    descriptor = _owned.get(Path(os.path.abspath(path)))
+def find_path(path: Path) -> Path:
+    """The present path of a locked folder, which may have been moved; of any other folder, `path` itself."""
+    descriptor = _locked_folders.get(Path(os.path.abspath(path)))
     if descriptor is None or is_at(path, descriptor):
         return path
-    name = _name(descriptor)
+    name = _find_name(descriptor)
     return name if is_at(name, descriptor) else path
 
 
@@ -182,41 +182,41 @@ def is_at(path: str | Path, descriptor: int, parent: int | None = None) -> bool:
         return False
 
 
-def through(descriptor: int, path: Path) -> Path:
-    """A path to an open folder for libraries that take nothing else.
+def descriptor_path(descriptor: int, path: Path) -> Path:
+    """A path to an open folder, for libraries that need one.
 
-    On Linux it leads there whatever the folder's name is or becomes. Elsewhere it is the name that it has now.
+    On Linux it stays valid whatever happens to the folder's name. Elsewhere it is the folder's present path.
 
     Args:
-      descriptor: of the folder.
+      descriptor: descriptor of the folder.
       path: where it was opened.
 
     Raises:
-      OSError: it has been moved to where the system does not tell, or removed.
+      OSError: the folder was removed, or moved and the system does not tell where.
     """
-    for name in (_by_number(descriptor), path, _name(descriptor)):
+    for name in (_number_path(descriptor), path, _find_name(descriptor)):
         if is_at(name, descriptor):
             return name
     raise OSError(errno.ENOENT, "the folder was moved or removed")
 
 
-def hides_names() -> bool:
-    """Whether `through` hides the names of folders, in which some libraries take some letters for patterns."""
-    with opened(Path("/")) as folder:
-        return is_at(_by_number(folder), folder)
+def has_descriptor_paths() -> bool:
+    """Whether `descriptor_path` hides folder names, whose characters some libraries take for patterns."""
+    with open_folder(Path("/")) as folder:
+        return is_at(_number_path(folder), folder)
 
 
-def _by_number(descriptor: int) -> Path:
+def _number_path(descriptor: int) -> Path:
     return Path(DESCRIPTORS, str(descriptor))
 
 
-def _name(descriptor: int) -> Path:
-    """The name that an open folder has now, as far as the system tells."""
+def _find_name(descriptor: int) -> Path:
+    """The present path of an open folder, if the system tells it."""
     try:
-        from jaxpg.posix import fcntl  # at its use: options are read and --help is printed without it
+        from jaxpg.posix import fcntl  # here, as options and --help do not need it
 
         if hasattr(fcntl, "F_GETPATH"):
             return Path(os.fsdecode(fcntl.fcntl(descriptor, fcntl.F_GETPATH, bytes(1024)).rstrip(b"\0")))
-        return _by_number(descriptor).readlink()
+        return _number_path(descriptor).readlink()
     except OSError:
         return Path(os.devnull)

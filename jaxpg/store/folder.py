@@ -1,16 +1,16 @@
-"""The run folder: what is in it, and under which name.
+"""The run folder and its files.
 
-config.yaml         the options, complete
-versions.json       what computed it
+config.yaml         all options
+versions.json       versions and machine
 metrics.jsonl       one line for each chunk of updates
 tb/                 the same for TensorBoard
-loggers/            what other loggers keep there, where they are asked for
+loggers/            files of other loggers, if any
 checkpoints/        the whole training state, the newest few
 best/               the best policy so far
 learning_curve.png  the curve
 report.html         the run as a page: curves, episodes to watch, options
-video.mp4           episodes as a video, where one was asked for
-lock                who is training in it, for as long as it does
+video.mp4           episodes as a video, if rendered
+lock                the process that is training in it
 """
 
 from __future__ import annotations
@@ -32,16 +32,16 @@ from jaxpg.config.configuration import Config
 from jaxpg.errors import UserError
 from jaxpg.store import files, lock
 from jaxpg.store.files import UNFINISHED
-from jaxpg.store.lines import sound
-from jaxpg.store.versions import versions
+from jaxpg.store.lines import parse_lines
+from jaxpg.store.versions import collect_versions
 
-LONGEST_TASK = 100  # letters of the task's name in a folder's: file systems take 255 bytes
-PATTERNS = "\\[]*?"  # what orbax and tensorstore take for more than a letter
-MOST_THREADS = 4096  # of XLA that versions.json can ask for: more than any machine has cores
+MAX_TASK_LENGTH = 100  # characters of the task in a folder's name: file systems allow 255 bytes
+PATTERN_CHARACTERS = "\\[]*?"  # characters with a special meaning in paths of orbax and tensorstore
+MAX_THREADS = 4096  # that versions.json can request: more than any machine has cores
 
 
 class RunFolder:
-    """The paths of one run, by the name that its folder was given."""
+    """The paths of a run, below its original folder name."""
 
     def __init__(self, path: str | Path):
         self._given = Path(path)
@@ -57,30 +57,30 @@ class RunFolder:
 
     @property
     def path(self) -> Path:
-        """The folder; one that this process owns is followed where it is moved."""
-        return files.whereabouts(self._given)
+        """The folder's path; if this process has locked the folder, its present path after a move."""
+        return files.find_path(self._given)
 
 
-def planned(config: Config) -> RunFolder:
-    """The run folder asked for, of which nothing is made yet; or else `runs/<env>-<algo>-s<seed>-<time>`, which is.
+def choose(config: Config) -> RunFolder:
+    """The run folder `run_dir`, not yet created; without one, a new folder `runs/<env>-<algo>-s<seed>-<time>`.
 
     Raises:
-      UserError: its name cannot be written in a line of text, or is not one for orbax.
+      UserError: the name cannot be printed on one line, or orbax cannot handle it.
     """
     run = config.run
     if run.run_dir is not None:
         folder = RunFolder(run.run_dir)
     else:
-        task = re.sub(r"[^\w.-]", "_", config.task)[:LONGEST_TASK].lstrip(".-")
+        task = re.sub(r"[^\w.-]", "_", config.task)[:MAX_TASK_LENGTH].lstrip(".-")
         stamp = time.strftime("%Y%m%d-%H%M%S")
-        folder = RunFolder(_made(Path("runs") / f"{task}-{config.choices['algo']}-s{run.seed}-{stamp}"))
+        folder = RunFolder(_make_new(Path("runs") / f"{task}-{config.choices['algo']}-s{run.seed}-{stamp}"))
     _check_name(folder.path)
     return folder
 
 
-def _made(path: Path) -> Path:
-    """A new folder of that name, or of one with a number after it: runs that begin in one second have their own."""
-    with _reported(path):
+def _make_new(path: Path) -> Path:
+    """Creates a folder of that name, with a number appended if runs start in the same second."""
+    with _report_errors(path):
         path.parent.mkdir(parents=True, exist_ok=True)
         for number in itertools.count(1):
             folder = path if number == 1 else path.with_name(f"{path.name}-{number}")
@@ -90,45 +90,47 @@ def _made(path: Path) -> Path:
 
 
 def _check_name(path: Path) -> None:
-    """Raises UserError for a name that configuration and messages cannot have, or from which orbax cannot read."""
+    """Raises UserError for a name that cannot be printed, or from which orbax cannot read."""
     if not str(path).isprintable():
-        raise UserError(f"run_dir={str(path)!r}: expected letters that can be printed, in UTF-8")
-    odd = sorted(set(PATTERNS) & set(str(path.absolute())))
-    if odd and not files.hides_names():
-        raise UserError(f"{path}: on this system checkpoints cannot be kept below a folder with {odd[0]} in its name")
+        raise UserError(f"run_dir={str(path)!r}: expected printable characters in UTF-8")
+    patterns = sorted(set(PATTERN_CHARACTERS) & set(str(path.absolute())))
+    if patterns and not files.has_descriptor_paths():
+        raise UserError(
+            f"{path}: on this system checkpoints cannot be kept below a folder with {patterns[0]} in its name"
+        )
 
 
 def check_empty(folder: RunFolder) -> None:
-    """Raises UserError where something is in the folder already, or where there can be none."""
-    if _names(folder.path):
-        raise UserError(f"{folder.path} is not empty: take another run_dir, or resume={folder.path}")
+    """Raises UserError if the folder is not empty, or cannot be one."""
+    if _list_names(folder.path):
+        raise UserError(f"{folder.path} is not empty: choose another run_dir, or resume={folder.path}")
 
 
 def check_nothing_to_lose(folder: RunFolder) -> None:
-    """Raises UserError where there is more in the folder than a run leaves that ended before its first checkpoint."""
+    """Raises UserError if the folder holds more than a run leaves that ended before its first checkpoint."""
     if not _is_run(folder) or _has_numbers(folder.checkpoints) or _has_numbers(folder.best):
         check_empty(folder)
 
 
 def has_checkpoints(folder: RunFolder) -> bool:
-    """Whether it is the folder of a run with something to resume."""
+    """Whether the folder holds a run with a checkpoint."""
     return _has_config(folder) and _has_numbers(folder.checkpoints)
 
 
 def _has_numbers(path: Path) -> bool:
-    """Whether a checkpoint is there, sound or not: its name is its number."""
-    return any(name.isdigit() for name in _names(path))
+    """Whether there is a checkpoint, sound or not: its name is a number."""
+    return any(name.isdigit() for name in _list_names(path))
 
 
-def _names(path: Path) -> list[str]:
-    """What is in a folder, but for what a process leaves that was killed: its lock and unfinished files."""
-    with _reported(path):
+def _list_names(path: Path) -> list[str]:
+    """The names in a folder, except for what a killed process leaves: its lock and unfinished files."""
+    with _report_errors(path):
         names = [entry.name for entry in path.iterdir()] if path.exists() else []
     return [name for name in names if name != lock.NAME and not name.endswith(UNFINISHED)]
 
 
 def _is_run(folder: RunFolder) -> bool:
-    """Whether a run of ours began there: `versions.json` is the first that it writes."""
+    """Whether one of our runs began there: it writes `versions.json` first."""
     try:
         return "jaxlib" in read_versions(folder)
     except UserError:
@@ -136,31 +138,31 @@ def _is_run(folder: RunFolder) -> bool:
 
 
 @contextlib.contextmanager
-def owned(folder: RunFolder, say: Callable[[str], None]) -> Iterator[None]:
-    """The folder, made where there is none, is this process's inside: what is written to its paths goes there.
+def own(folder: RunFolder, say: Callable[[str], None]) -> Iterator[None]:
+    """Creates the folder if needed and locks it in the block; its paths lead there even if it is moved.
 
     Args:
-      folder: of the run.
-      say: takes a note, where the folder cannot be locked.
+      folder: the run folder.
+      say: takes a note if the folder cannot be locked.
 
     Raises:
-      UserError: it is another's, or cannot be made or written to.
+      UserError: another process owns the folder, or it cannot be created or written.
     """
     path = folder.path
     with contextlib.ExitStack() as stack:
-        with _reported(path):
+        with _report_errors(path):
             path.mkdir(parents=True, exist_ok=True)
-            descriptor = stack.enter_context(lock.held(path, say))
-        stack.enter_context(files.owned(path, descriptor))
+            descriptor = stack.enter_context(lock.hold(path, say))
+        stack.enter_context(files.redirect(path, descriptor))
         for place in (folder.checkpoints, folder.best):
-            _check_own(place)
+            _check_no_links(place)
         yield
 
 
-def _check_own(place: Path) -> None:
-    """Raises UserError where checkpoints would be written and removed through links, or there is no folder for them."""
+def _check_no_links(place: Path) -> None:
+    """Raises UserError if the path is not a folder, or links are in it through which files would be changed."""
     try:
-        with files.opened(place) as descriptor:
+        with files.open_folder(place) as descriptor:
             files.check_no_links(descriptor)
     except FileNotFoundError:
         pass
@@ -169,7 +171,7 @@ def _check_own(place: Path) -> None:
 
 
 @contextlib.contextmanager
-def _reported(path: Path) -> Iterator[None]:
+def _report_errors(path: Path) -> Iterator[None]:
     try:
         yield
     except OSError as error:
@@ -177,16 +179,14 @@ def _reported(path: Path) -> Iterator[None]:
 
 
 def replace(path: str | Path, content: str | bytes) -> None:
-    """Writes a file that others, and who comes after a kill or a power failure, see as it was or whole.
-
-    A link of that name is replaced, and what it leads to stays as it is; a folder in a run folder is no link.
+    """Replaces a file atomically, see `files.replace`.
 
     Args:
-      path: the file, in a folder that is there.
-      content: text is written as UTF-8; what no text has, but a file's name may, as an escape.
+      path: the file, in an existing folder.
+      content: text is written as UTF-8, with lone surrogates, which file names may contain, as escapes.
 
     Raises:
-      UserError: it cannot be written.
+      UserError: the file cannot be written.
     """
     data = content.encode("utf-8", "backslashreplace") if isinstance(content, str) else content
     try:
@@ -199,18 +199,18 @@ def read(path: Path) -> str:
     """The text of a file.
 
     Raises:
-      UserError: there is none, or it is a link in a run folder, no file, or no text.
+      UserError: it is missing, not a file, not text, or a link in a run folder.
     """
     try:
         return files.read(path).decode()
     except OSError as error:
         raise UserError(f"{path}: cannot be read ({error.strerror})") from error
     except UnicodeDecodeError as error:
-        raise UserError(f"{path}: cannot be read (it is no text in UTF-8)") from error
+        raise UserError(f"{path}: cannot be read (it is not UTF-8 text)") from error
 
 
 def find(path: str) -> RunFolder:
-    """The run folder at `path`; raises UserError where there is none."""
+    """The run folder at `path`; raises UserError if there is none."""
     folder = RunFolder(path)
     if not _has_config(folder):
         raise UserError(f"{path} is not a run folder: it has no config.yaml")
@@ -218,7 +218,7 @@ def find(path: str) -> RunFolder:
 
 
 def _has_config(folder: RunFolder) -> bool:
-    """Whether there is one; raises UserError where the system does not tell, or it is no file."""
+    """Whether there is a `config.yaml`; raises UserError if that cannot be found out, or it is not a file."""
     try:
         mode = os.lstat(folder.config).st_mode
     except (FileNotFoundError, NotADirectoryError):
@@ -226,56 +226,56 @@ def _has_config(folder: RunFolder) -> bool:
     except OSError as error:
         raise UserError(f"{folder.path} cannot be read as a run folder ({error.strerror})") from error
     if not stat.S_ISREG(mode):
-        reason = files.A_LINK if stat.S_ISLNK(mode) else "it is no file"
+        reason = files.LINK_REFUSED if stat.S_ISLNK(mode) else "it is not a file"
         raise UserError(f"{folder.config}: cannot be read ({reason})")
     return True
 
 
 def write_versions(folder: RunFolder) -> None:
     """Writes `versions.json`, the first file of a run."""
-    replace(folder.versions, json.dumps(versions(), indent=1))
+    replace(folder.versions, json.dumps(collect_versions(), indent=1))
 
 
 def change_versions(folder: RunFolder, recorded: dict[str, Any], now: dict[str, Any]) -> None:
-    """Records what goes on with a run; what computed it before stays in `versions.json` too, as `earlier`."""
-    before = {name: value for name, value in recorded.items() if name != "earlier"}
-    replace(folder.versions, json.dumps({**now, "earlier": [*recorded.get("earlier", []), before]}, indent=1))
+    """Records the versions that continue a run; the previous ones stay in `versions.json` as `earlier`."""
+    previous = {name: value for name, value in recorded.items() if name != "earlier"}
+    replace(folder.versions, json.dumps({**now, "earlier": [*recorded.get("earlier", []), previous]}, indent=1))
 
 
 def read_versions(folder: RunFolder) -> dict[str, Any]:
-    """What computed the run; raises UserError if the file cannot be read, or is not as `write_versions` left it."""
+    """The contents of `versions.json`; raises UserError if it cannot be read or is malformed."""
     try:
         recorded = json.loads(read(folder.versions))
     except (ValueError, RecursionError) as error:
         raise UserError(f"{folder.versions}: cannot be read ({error})") from error
     if not isinstance(recorded, dict) or not _is_number_of_threads(recorded.get("threads", 1)):
-        expected = f"an object whose threads is at least 1, and at most {MOST_THREADS}"
-        raise UserError(f"{folder.versions}: not what a run writes there, {expected}")
+        expected = f"expected an object with threads from 1 to {MAX_THREADS}"
+        raise UserError(f"{folder.versions}: not written by a run: {expected}")
     earlier = recorded.get("earlier", [])
     if not isinstance(earlier, list) or not all(isinstance(part, dict) for part in earlier):
-        raise UserError(f"{folder.versions}: not what a run writes there, a list of objects as earlier")
+        raise UserError(f"{folder.versions}: not written by a run: expected a list of objects as earlier")
     return recorded
 
 
 def _is_number_of_threads(value: Any) -> bool:
-    return type(value) is int and 1 <= value <= MOST_THREADS
+    return type(value) is int and 1 <= value <= MAX_THREADS
 
 
 def read_metrics(folder: RunFolder, agents: int | None = None) -> list[dict[str, Any]]:
-    """The sound lines of `metrics.jsonl`; empty where there is no such file.
+    """The sound lines of `metrics.jsonl`; empty if there is no such file.
 
     Args:
-      folder: of the run.
-      agents: that it has; None: as many as in most lines.
+      folder: the run folder.
+      agents: number of agents; None: that of most lines.
 
     Raises:
-      UserError: it is there and cannot be read.
+      UserError: the file exists but cannot be read.
     """
-    return sound(metrics_text(folder), agents)[0]
+    return parse_lines(read_metrics_text(folder), agents)[0]
 
 
-def metrics_text(folder: RunFolder) -> str:
-    """What `metrics.jsonl` has; bytes that are no text become a letter that is in no sound line."""
+def read_metrics_text(folder: RunFolder) -> str:
+    """The text of `metrics.jsonl`; invalid bytes become a character that no sound line contains."""
     try:
         return files.read(folder.metrics).decode(errors="replace")
     except FileNotFoundError:
@@ -284,7 +284,7 @@ def metrics_text(folder: RunFolder) -> str:
         raise UserError(f"{folder.metrics}: cannot be read ({error.strerror})") from error
 
 
-def jsonable(values: np.ndarray) -> Any:
-    """A number, or a list of them where there are several agents; what is not finite becomes None."""
+def to_json(values: np.ndarray) -> Any:
+    """A number, or a list of them for several agents; None for values that are not finite."""
     numbers = [float(x) if np.isfinite(x) else None for x in np.atleast_1d(values)]
     return numbers[0] if len(numbers) == 1 else numbers

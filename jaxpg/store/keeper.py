@@ -1,4 +1,4 @@
-"""What a run keeps on disk, and what becomes of a save that fails."""
+"""Saves the checkpoints of a run, and survives saves that fail."""
 
 from __future__ import annotations
 
@@ -11,19 +11,19 @@ from jaxpg.store.metrics_log import MetricsLog
 
 
 class Keeper:
-    """Writes the run's state to `checkpoints/` and its best policy to `best/`, or says that it could not.
+    """Writes the run's state to `checkpoints/` and its best policy to `best/`; a failure only gives a note.
 
     Args:
-      config, folder: of the run.
+      config, folder: configuration and folder of the run.
       say: takes notes.
 
     Attributes:
-      saved: the last update whose state, best policy and lines of metrics this process has saved; None before.
-      failed: whether the last save has failed.
+      saved: the last update whose state, best policy and metrics this process has saved; None before the first.
+      failed: whether the last save failed.
     """
 
     def __init__(self, config: Config, folder: RunFolder, say: Callable[[str], None]):
-        from jaxpg.store.checkpoint import Checkpoints  # and orbax, which is slow to import
+        from jaxpg.store.checkpoint import Checkpoints  # with orbax, which is slow to import
 
         self._checkpoints = Checkpoints(folder.checkpoints)
         self._best = Checkpoints(folder.best, keep=1)
@@ -34,34 +34,34 @@ class Keeper:
         self.failed = False
 
     def save(self, update: int, state: RunState, log: MetricsLog) -> None:
-        """Saves the state after `update` updates; the first of several failures is said, and the end of them.
+        """Saves the state after `update` updates; notes the first of several failures, and their end.
 
         Args:
-          update, state: what is saved.
-          log: the lines of metrics, which are written before a checkpoint that has them.
+          update, state: the state to save, and its number of updates.
+          log: the log of metrics, whose lines are written before the checkpoint.
         """
-        problem = self._problem(update, state, log)
+        problem = self._try_save(update, state, log)
         if problem and not self.failed:
-            self._say(f"note: {problem}; training goes on, and saving is tried again at each line of metrics")
+            self._say(f"note: {problem}; training continues, and saving is tried again at each line of metrics")
         elif self.failed and not problem:
-            self._say(f"note: saved again, after {update:,} updates")
+            self._say(f"note: saving works again, after {update:,} updates")
         self.failed = problem is not None
         if not problem:
             self.saved = update
 
-    def _problem(self, update: int, state: RunState, log: MetricsLog) -> str | None:
-        """Saves; what has kept it from that."""
+    def _try_save(self, update: int, state: RunState, log: MetricsLog) -> str | None:
+        """Saves; returns the reason if it fails."""
         from jaxpg.store.checkpoint import SaveError
 
         try:
-            log.flush()  # first: a checkpoint whose lines are not there would be resumed with a gap
+            log.flush()  # first: without its lines, a resumed run would have a gap
             if self._last != update:  # else only the best policy is missing
-                self._checkpoints.replace(update, state, self._meta)  # damaged ones may be newer than what was resumed
+                self._checkpoints.replace(update, state, self._meta)  # there may be newer ones that are damaged
                 self._last = update
             self._best.replace(update, state.best, self._meta)
         except SaveError as error:
             return str(error)
         except OSError as error:
             where = self._checkpoints.folder / str(update)
-            return f"{where}: not written without its lines of metrics, which cannot be ({error.strerror})"
+            return f"{where}: not written, as its lines of metrics cannot be ({error.strerror})"
         return None

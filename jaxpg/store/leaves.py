@@ -1,4 +1,4 @@
-"""The leaves of a tree of arrays as a checkpoint has them: by name, on the host, each described by its digest."""
+"""The leaves of a tree of arrays as stored in a checkpoint: by name, on the host, each with a digest."""
 
 from __future__ import annotations
 
@@ -15,19 +15,19 @@ from jaxpg.program.state import is_key
 from jaxpg.types import PyTree
 
 
-def kinds_of(recorded: Mapping[str, Any]) -> dict[str, jax.ShapeDtypeStruct]:
-    """Shape and type of each recorded leaf."""
+def recorded_shapes(recorded: Mapping[str, Any]) -> dict[str, jax.ShapeDtypeStruct]:
+    """Shape and type of each leaf in a checkpoint's record."""
     return {name: jax.ShapeDtypeStruct(shape, dtype) for name, (shape, dtype, _) in recorded.items()}
 
 
-def on_host(tree: PyTree) -> dict[str, np.ndarray]:
-    """Every leaf of a tree by its name; random keys as the numbers that they are stored as."""
+def to_host(tree: PyTree) -> dict[str, np.ndarray]:
+    """Every leaf of a tree by its name; random keys as their numbers."""
     paths, _ = jax.tree_util.tree_flatten_with_path(tree)
-    return {name_of(path): np.asarray(_to_storage(leaf)) for path, leaf in paths}
+    return {leaf_name(path): np.asarray(_to_storage(leaf)) for path, leaf in paths}
 
 
-def name_of(path: tuple) -> str:
-    """The name of a leaf by its place in the tree, such as `train/params/actor`."""
+def leaf_name(path: tuple) -> str:
+    """The name of a leaf, from its place in the tree, such as `train/params/actor`."""
     return jax.tree_util.keystr(path, simple=True, separator="/")
 
 
@@ -35,19 +35,19 @@ def _to_storage(leaf: Any) -> Any:
     return jax.random.key_data(leaf) if is_key(leaf) else leaf
 
 
-def stored_as(leaf: Any) -> jax.ShapeDtypeStruct:
-    """Shape and type that a leaf is stored with."""
+def storage_shape(leaf: Any) -> jax.ShapeDtypeStruct:
+    """Shape and type of a leaf in storage."""
     return jax.eval_shape(_to_storage, leaf)
 
 
 def from_storage(array: Any, leaf: Any) -> jax.Array:
-    """The leaf that was stored as this array; `leaf` is one of the same kind, or its shape and type."""
+    """The leaf stored as this array; `leaf` is one of the same kind, or its shape and type."""
     array = jax.device_put(array)  # jax.numpy.asarray would compile a program for it
     return jax.random.wrap_key_data(array, impl=_key_impl(leaf)) if is_key(leaf) else array
 
 
 def _key_impl(leaf: Any) -> str:
-    """Whose random keys these are; of shapes and types, which `jax.random.key_impl` does not take, as well."""
+    """The implementation of random keys, also for shapes and types, which `jax.random.key_impl` does not take."""
     names = ("threefry2x32", "rbg", "unsafe_rbg")
     return next(
         name for name in names if jax.eval_shape(functools.partial(jax.random.key, 0, impl=name)).dtype == leaf.dtype
@@ -59,6 +59,6 @@ def digest(record: Mapping[str, Any]) -> str:
     return hashlib.sha256(json.dumps(record, sort_keys=True).encode()).hexdigest()
 
 
-def described(leaf: np.ndarray) -> list[Any]:
+def describe(leaf: np.ndarray) -> list[Any]:
     """Shape, type and SHA-256."""
     return [list(leaf.shape), str(leaf.dtype), hashlib.sha256(np.ascontiguousarray(leaf).tobytes()).hexdigest()]

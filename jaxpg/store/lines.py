@@ -8,46 +8,46 @@ from collections import Counter
 from collections.abc import Iterable, Mapping
 from typing import Any
 
-LARGEST = 2**63  # below it are all counts
+MAX_COUNT = 2**63  # exclusive
 
 
-def json_line(line: Mapping[str, Any]) -> str:
-    """A line as it is written; its values are finite numbers, None, or lists of these with one for each agent."""
+def format_line(line: Mapping[str, Any]) -> str:
+    """The line as text; its values are finite numbers, None, or lists of these with one per agent."""
     return json.dumps(line, allow_nan=False) + "\n"
 
 
-def sound(text: str, agents: int | None = None) -> tuple[list[dict[str, Any]], list[int]]:
-    """The lines of a run as they were written, and the numbers, from 1, of those that are damaged.
+def parse_lines(text: str, agents: int | None = None) -> tuple[list[dict[str, Any]], list[int]]:
+    """Parses metrics; returns the sound lines and the numbers, from 1, of the damaged ones.
 
-    Of a run all lines have the same number of agents and of steps per update, and their updates grow: a line that
-    differs from most in that is damaged, too. A last line that is not whole is neither: a kill leaves it so.
+    All lines of a run have the same number of agents and of steps per update, and their updates increase. A line that
+    differs from the majority in these is damaged too. An incomplete last line, as a kill leaves it, is ignored.
 
     Args:
       text: the content of the file.
-      agents: of the run; None: as many as in most lines.
+      agents: number of agents of the run; None: that of most lines.
     """
-    *texts, torn = text.split("\n")
-    lines = [_parsed(one) for one in texts + [torn] * (_parsed(torn) is not None)]
-    lines = [line if line and agents in (None, _agents(line)) else None for line in lines]
+    *texts, rest = text.split("\n")
+    lines = [_parse_line(one) for one in texts + [rest] * (_parse_line(rest) is not None)]
+    lines = [line if line and agents in (None, _count_agents(line)) else None for line in lines]
     kinds = Counter(_kind(line) for line in lines if line)
     usual, last = max(kinds, key=kinds.__getitem__, default=None), 0
-    found, damaged = [], []
+    sound, damaged = [], []
     for number, line in enumerate(lines, 1):
-        if line and _agents(line) and _kind(line) == usual and line["update"] > last:
-            found.append(line)
+        if line and _count_agents(line) and _kind(line) == usual and line["update"] > last:
+            sound.append(line)
             last = line["update"]
         else:
             damaged.append(number)
-    return found, damaged
+    return sound, damaged
 
 
-def up_to(lines: Iterable[dict[str, Any]], update: int) -> list[dict[str, Any]]:
-    """The lines of the first updates: those that a checkpoint after `update` of them goes on from."""
+def select_until(lines: Iterable[dict[str, Any]], update: int) -> list[dict[str, Any]]:
+    """The lines up to `update`: those that a run resumed from that checkpoint keeps."""
     return [line for line in lines if line["update"] <= update]
 
 
-def _parsed(text: str) -> dict[str, Any] | None:
-    """The line, if it is one: an object of numbers with those that every line has."""
+def _parse_line(text: str) -> dict[str, Any] | None:
+    """The line, or None if the text is not an object of numbers with the required entries."""
     try:
         line = json.loads(text)
     except (ValueError, RecursionError):
@@ -59,22 +59,22 @@ def _parsed(text: str) -> dict[str, Any] | None:
 
 
 def _kind(line: Mapping[str, Any]) -> tuple[int, float]:
-    """What all lines of a run have in common: how many agents, and steps per update."""
-    return _agents(line), line["steps"] / line["update"]
+    """Number of agents and steps per update, which all lines of a run share."""
+    return _count_agents(line), line["steps"] / line["update"]
 
 
-def _agents(line: Mapping[str, Any]) -> int:
-    """How many values there are of everything; 0 where the lists differ in that."""
+def _count_agents(line: Mapping[str, Any]) -> int:
+    """Number of agents in a line; 0 if its lists differ in length."""
     numbers = {len(value) for value in line.values() if isinstance(value, list)} or {1}
     return max(numbers) if len(numbers) == 1 else 0
 
 
 def _is_count(value: Any) -> bool:
-    return type(value) is int and 1 <= value < LARGEST
+    return type(value) is int and 1 <= value < MAX_COUNT
 
 
 def _is_number(value: Any) -> bool:
-    return (type(value) is int and abs(value) < LARGEST) or (type(value) is float and math.isfinite(value))
+    return (type(value) is int and abs(value) < MAX_COUNT) or (type(value) is float and math.isfinite(value))
 
 
 def _is_value(value: Any) -> bool:

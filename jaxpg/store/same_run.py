@@ -1,4 +1,4 @@
-"""Whether options, a run folder and its checkpoints are of one and the same run."""
+"""Checks that options, a run folder and its checkpoints belong to the same run."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from jaxpg.store.folder import RunFolder
 if TYPE_CHECKING:  # orbax is slow to import
     from jaxpg.store.checkpoint import Checkpoints
 
-# What may change together with resume=DIR; anything else would be another run.
+# Options that may change with resume=DIR; changing any other would make it another run.
 RESUMABLE = (
     *("total_steps", "log_interval", "eval_interval", "checkpoint_interval"),
     *("stop_return", "stop_agents", "nan_policy", "loggers", "cache", "report"),
@@ -22,22 +22,23 @@ RESUMABLE = (
 
 
 def check_options(run_folder: RunFolder, stored: Config, config: Config) -> None:
-    """Raises UserError where an option differs that would make it another run."""
-    differences = _differences(stored, config)
+    """Raises UserError if an option differs that may not change on resume."""
+    differences = _find_differences(stored, config)
     if differences:
-        _, has, given = differences[0]
-        raise UserError(f"{given}: {run_folder.path} has {has}, and on resume only {', '.join(RESUMABLE)} may change")
+        _, old, new = differences[0]
+        raise UserError(f"{new}: {run_folder.path} has {old}, and on resume only {', '.join(RESUMABLE)} may change")
 
 
 def check_checkpoint(checkpoints: Checkpoints, number: int, config: Config) -> None:
-    """Compares the options that a checkpoint was made with.
+    """Checks that a checkpoint was made with the options of the run folder.
 
     Args:
-      checkpoints, number: which.
-      config: of the run folder.
+      checkpoints, number: the checkpoint.
+      config: configuration of the run folder.
 
     Raises:
-      OtherRunError: they would make it another run. CheckpointError: it cannot be read, or has none.
+      OtherRunError: its options belong to another run.
+      CheckpointError: it cannot be read, or has no options.
     """
     from jaxpg.store.checkpoint import CheckpointError, OtherRunError
 
@@ -45,19 +46,19 @@ def check_checkpoint(checkpoints: Checkpoints, number: int, config: Config) -> N
     try:
         made_with = configuration.from_dict(checkpoints.record(number)["meta"]["config"])
     except (TypeError, KeyError, OptionError) as error:
-        raise CheckpointError(f"{where}: has no options that a run could be made with ({error})") from error
-    for name, has, given in _differences(made_with, config):
+        raise CheckpointError(f"{where}: its options are not those of a run ({error})") from error
+    for name, old, new in _find_differences(made_with, config):
         if name != "run_dir":  # the folder may have been moved
-            advice = "put that right, or take away the checkpoint of another run"
-            raise OtherRunError(f"{where}: made with {has}, but config.yaml has {given}; {advice}")
+            advice = "correct it, or remove the checkpoint of another run"
+            raise OtherRunError(f"{where}: made with {old}, but config.yaml has {new}; {advice}")
 
 
-def _differences(before: Config, after: Config) -> list[tuple[str, str, str]]:
-    """The options that make another run: name, and in words what it was and what it is."""
+def _find_differences(before: Config, after: Config) -> list[tuple[str, str, str]]:
+    """The differing options that make it another run: name, and descriptions of the old and the new value."""
     old, new = configuration.named(before), configuration.named(after)
     names = [name for name in old | new if name not in RESUMABLE and old.get(name) != new.get(name)]
-    return [(name, _in_words(name, old), _in_words(name, new)) for name in names]
+    return [(name, _describe(name, old), _describe(name, new)) for name in names]
 
 
-def _in_words(name: str, values: Mapping[str, Any]) -> str:
+def _describe(name: str, values: Mapping[str, Any]) -> str:
     return f"{name}={values[name]}" if name in values else f"no {name}"

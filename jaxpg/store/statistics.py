@@ -1,6 +1,6 @@
 """Aggregates over episodes and over seeds: means, the interquartile mean, the probability of improvement, intervals.
 
-An interval is only given where there are seeds enough to carry one.
+An interval is given only if there are enough seeds for one.
 """
 
 from __future__ import annotations
@@ -13,55 +13,55 @@ import numpy as np
 CONFIDENCE = 0.95
 
 
-def fewest_seeds(confidence: float = CONFIDENCE) -> int:
-    """How many seeds a bootstrap interval needs.
+def min_seeds(confidence: float = CONFIDENCE) -> int:
+    """The smallest number of seeds for a bootstrap interval.
 
         P(min < centre < max) = 1 - 2^(1 - S),    of S independent values about their median
 
-    A bootstrap interval lies within the values that it is made of, so with fewer it cannot have its confidence, however
-    they have come out: one value gives a point, which always looks certain.
+    A bootstrap interval lies within the range of its values. With fewer seeds it cannot reach its confidence, whatever
+    the values are: a single value gives a point, which always looks certain.
 
-    >>> fewest_seeds(0.95), fewest_seeds(0.5)
+    >>> min_seeds(0.95), min_seeds(0.5)
     (6, 2)
     """
     return math.ceil(1 - math.log2(1 - confidence) - 1e-9)
 
 
-def counted_returns(episode_return: np.ndarray, diverged: np.ndarray) -> np.ndarray:
-    """Returns of an evaluation's episodes, with those whose physics diverged at what they count as.
+def penalize_diverged(episode_return: np.ndarray, is_diverged: np.ndarray) -> np.ndarray:
+    """Returns of an evaluation's episodes, with a penalty for those whose physics diverged.
 
         R_i = min(0, min of R_j over the sound episodes j)    where episode i diverged
 
-    What such an episode earned is no measure: it ended early, which looks good where rewards are negative, and what it
-    earned on its way to infinity can have any size and sign. It counts as the worst of the others, and as 0 at best.
+    The return of such an episode says nothing: it ended early, which looks good if rewards are negative, and on its way
+    to infinity it can have any size and sign. It counts as the worst of the others, at most 0.
 
     Args:
-      episode_return: of the episodes, `[..., N]`.
-      diverged: which of them did, `[..., N]` of bool.
+      episode_return: returns of the episodes, `[..., N]`.
+      diverged: whether their physics diverged, `[..., N]` of bool.
 
     Returns:
-      `[..., N]`, float64; NaN in all places that diverged where every episode of the row did.
+      `[..., N]`, float64; NaN in rows in which every episode diverged.
 
-    >>> counted_returns(np.array([-3.0, -0.5, -7.0]), np.array([False, True, False])).tolist()
+    >>> penalize_diverged(np.array([-3.0, -0.5, -7.0]), np.array([False, True, False])).tolist()
     [-3.0, -7.0, -7.0]
     """
-    returns, diverged = np.asarray(episode_return, float), np.asarray(diverged, bool)
-    worst = np.min(np.where(diverged, np.inf, returns), axis=-1, keepdims=True)
-    worst = np.where(diverged.all(axis=-1, keepdims=True), np.nan, np.minimum(worst, 0.0))
-    return np.where(diverged, worst, returns)
+    returns, is_diverged = np.asarray(episode_return, float), np.asarray(is_diverged, bool)
+    worst = np.min(np.where(is_diverged, np.inf, returns), axis=-1, keepdims=True)
+    worst = np.where(is_diverged.all(axis=-1, keepdims=True), np.nan, np.minimum(worst, 0.0))
+    return np.where(is_diverged, worst, returns)
 
 
 def finite_mean(values: np.ndarray) -> np.ndarray:
-    """The mean of each row's finite numbers, `[..., N]` to `[...]`; NaN where it has none.
+    """The mean of each row's finite numbers, `[..., N]` to `[...]`; NaN if there are none.
 
     >>> finite_mean(np.array([[1.0, np.nan, 3.0], [np.inf, np.nan, np.nan]])).tolist()
     [2.0, nan]
     """
     values = np.asarray(values, float)
     finite = np.isfinite(values)
-    number = finite.sum(axis=-1)
+    count = finite.sum(axis=-1)
     total = np.where(finite, values, 0.0).sum(axis=-1)
-    return np.where(number > 0, total / np.maximum(number, 1), np.nan)
+    return np.where(count > 0, total / np.maximum(count, 1), np.nan)
 
 
 def interquartile_mean(scores: np.ndarray) -> np.ndarray:
@@ -93,52 +93,52 @@ def bootstrap_interval(
 
     Args:
       scores: one row for each seed, `[S, ...]`.
-      confidence: probability that the interval is meant to have.
-      resamples: how many samples of S seeds are drawn, with replacement.
-      seed: of the resampling.
+      confidence: nominal probability of the interval.
+      resamples: number of samples of S seeds, drawn with replacement.
+      seed: seed of the resampling.
 
     Returns:
-      Lower and upper end, `[...]` each; NaN of fewer than `fewest_seeds(confidence)`.
+      Lower and upper end, `[...]` each; NaN for fewer than `min_seeds(confidence)` seeds.
 
     Source: Efron, Annals of Statistics 7 (1979).
     """
     scores = np.asarray(scores, float)
-    if len(scores) < fewest_seeds(confidence):
+    if len(scores) < min_seeds(confidence):
         return np.full(scores.shape[1:], np.nan), np.full(scores.shape[1:], np.nan)
     draws = np.random.default_rng(seed).integers(len(scores), size=(resamples, len(scores)))
     means, tail = np.stack([interquartile_mean(scores[draw]) for draw in draws]), (1 - confidence) / 2
     return np.quantile(means, tail, axis=0), np.quantile(means, 1 - tail, axis=0)
 
 
-def spread(scores: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """What is drawn and written around an interquartile mean, as `spread_name` calls it.
+def seed_interval(scores: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The interval to show around an interquartile mean; `seed_interval_name` names it.
 
     Args:
       scores: one row for each seed, `[S, ...]`.
 
     Returns:
-      Lower and upper end, `[...]` each: the bootstrap interval; of too few seeds their lowest and highest score.
+      Lower and upper end, `[...]` each: the bootstrap interval, or with too few seeds the lowest and highest score.
     """
     scores = np.asarray(scores, float)
     return bootstrap_interval(scores) if has_interval(len(scores)) else (scores.min(axis=0), scores.max(axis=0))
 
 
 def has_interval(number: int) -> bool:
-    """Whether so many seeds carry an interval of the usual confidence."""
-    return number >= fewest_seeds()
+    """Whether this many seeds are enough for an interval of the usual confidence."""
+    return number >= min_seeds()
 
 
-def spread_name(number: int) -> str:
-    """What `spread` of so many seeds is.
+def seed_interval_name(number: int) -> str:
+    """The name of `seed_interval` for this many seeds.
 
-    >>> spread_name(3), spread_name(10)
+    >>> seed_interval_name(3), seed_interval_name(10)
     ('lowest to highest', '95 % interval')
     """
     return f"{100 * CONFIDENCE:.0f} % interval" if has_interval(number) else "lowest to highest"
 
 
 def probability_of_improvement(x: np.ndarray, y: np.ndarray) -> float:
-    """How probable it is that a run of X is better than one of Y.
+    """The probability that a run of X is better than a run of Y.
 
         P(X > Y) = mean over i, j of [x_i > y_j] + [x_i = y_j] / 2
 
@@ -155,20 +155,20 @@ def probability_of_improvement(x: np.ndarray, y: np.ndarray) -> float:
 
 
 def improvement_interval(x: np.ndarray, y: np.ndarray, confidence: float = CONFIDENCE) -> tuple[float, float]:
-    """Interval of `probability_of_improvement`: the values of P that lie within z standard errors of the one found.
+    """Interval of `probability_of_improvement`: the values of P within z standard errors of the estimate.
 
-        |P - P_found| = z sqrt(V(P)),    V(P) = P (1 - P) (1 + M (1 - P) / (2 - P) + M P / (1 + P)) / (S R)
+        |P - P_hat| = z sqrt(V(P)),      V(P) = P (1 - P) (1 + M (1 - P) / (2 - P) + M P / (1 + P)) / (S R)
         M = (S + R) / 2 - 1,    z: the normal distribution's quantile at (1 + confidence) / 2
 
-    Unlike a bootstrap interval it does not shrink to a point where all of X are better than all of Y.
+    Unlike a bootstrap interval it does not shrink to a point if all of X are better than all of Y.
 
     Args:
       x, y: a score for each seed, `[S]` and `[R]`.
-      confidence: probability that the interval is meant to have.
+      confidence: nominal probability of the interval.
 
     Returns:
-      Lower and upper end; NaN where the seeds are too few for any outcome to leave out one half: where the smallest
-      two-sided probability of the rank test, 2 / C(S + R, S), is more than 1 - confidence, or where one is alone.
+      Lower and upper end; NaN if there are too few seeds for any outcome to exclude one half: if the smallest two-sided
+      probability of the rank test, 2 / C(S + R, S), exceeds 1 - confidence, or if S or R is 1.
 
     Source: Newcombe, Statistics in Medicine 25 (2006), method 5.
 
@@ -177,16 +177,16 @@ def improvement_interval(x: np.ndarray, y: np.ndarray, confidence: float = CONFI
     """
     if min(len(x), len(y)) < 2 or 2 / math.comb(len(x) + len(y), len(x)) > 1 - confidence:
         return math.nan, math.nan
-    found = probability_of_improvement(x, y)
-    return 1 - _upper_end(1 - found, len(x), len(y), confidence), _upper_end(found, len(x), len(y), confidence)
+    estimate = probability_of_improvement(x, y)
+    return 1 - _upper_end(1 - estimate, len(x), len(y), confidence), _upper_end(estimate, len(x), len(y), confidence)
 
 
-def _upper_end(found: float, S: int, R: int, confidence: float) -> float:
-    """The P above the one found that is z standard errors away from it: by bisection, as z V^(1/2) falls short at 1."""
-    z, low, high = statistics.NormalDist().inv_cdf((1 + confidence) / 2), found, 1.0
+def _upper_end(estimate: float, S: int, R: int, confidence: float) -> float:
+    """The P that is z standard errors above the estimate: by bisection, as z V^(1/2) falls short at 1."""
+    z, low, high = statistics.NormalDist().inv_cdf((1 + confidence) / 2), estimate, 1.0
     for _ in range(60):
         P = (low + high) / 2
         M = (S + R) / 2 - 1
         variance = P * (1 - P) * (1 + M * (1 - P) / (2 - P) + M * P / (1 + P)) / (S * R)
-        low, high = (P, high) if P - found < z * math.sqrt(variance) else (low, P)
+        low, high = (P, high) if P - estimate < z * math.sqrt(variance) else (low, P)
     return high

@@ -1,7 +1,7 @@
-"""Standard error while XLA compiles: without its alarms, and without its lines about another machine.
+"""Filters standard error while XLA compiles: removes its alarms and its messages about another machine.
 
-They are written by C++, so the file descriptor itself is led through a pipe. Who reads that is a process of its own, as
-which this file is run: if the compiler ends the training's process, its last words are passed on all the same.
+They are written by C++, so the file descriptor itself is redirected to a pipe. A separate process, which runs this
+file, reads the pipe: even if the compiler aborts the training process, its last messages get through.
 """
 
 from __future__ import annotations
@@ -13,45 +13,45 @@ import subprocess
 import sys
 from collections.abc import Iterator
 
-# XLA's words for a program that it takes for another machine's; some CPUs never know their own.
+# XLA's message for a program that it takes for another machine's; some CPUs do not recognise their own.
 OTHER_MACHINE = b"Machine type used for XLA:CPU compilation"
-# The same of what is no capability but a choice between instructions, which it makes on every CPU with AVX-512.
+# The same message for a preference, not a capability; it appears on every CPU with AVX-512.
 PREFERENCE = re.compile(rb"feature \+?prefer-")
 # After two minutes: "Very slow compile? If you want to file a bug ...", between lines of asterisks.
 ALARM = re.compile(rb"slow_operation_alarm\.cc|Very slow compile\?|^\*{8,}$|^The operation took ")
-REFUSED = 3  # exit status of the process where XLA has refused a program as another machine's
-PATIENCE = 5.0  # seconds; what was started meanwhile may hold the pipe for longer
+REFUSED = 3  # exit status of the filter if XLA refused a program as another machine's
+PATIENCE = 5.0  # seconds; processes started in the meantime may keep the pipe open longer
 
 
-class Seen:
-    """What has come by; `refused`: whether XLA took a program for another machine's."""
+class FilterResult:
+    """What the filter saw; `refused`: whether XLA took a program for another machine's."""
 
     refused = False
 
 
 @contextlib.contextmanager
-def filtered() -> Iterator[Seen]:
-    """Standard error is filtered inside; where there is none, or no process to filter it, nothing is changed.
+def filter_stderr() -> Iterator[FilterResult]:
+    """Filters standard error in the block; does nothing if that is impossible.
 
     Yields:
-      What has come by, complete only afterwards.
+      What the filter saw, complete only after the block.
     """
-    seen = Seen()
+    result = FilterResult()
     with contextlib.ExitStack() as stack:
         with contextlib.suppress(OSError):
-            stack.enter_context(_led_through_a_process(seen))
-        yield seen
+            stack.enter_context(_pipe_through_filter(result))
+        yield result
 
 
 @contextlib.contextmanager
-def _led_through_a_process(seen: Seen) -> Iterator[None]:
-    before, (reader, writer) = os.dup(2), os.pipe()
+def _pipe_through_filter(result: FilterResult) -> Iterator[None]:
+    original, (reader, writer) = os.dup(2), os.pipe()
     try:
-        # In a session of its own, where Ctrl-C does not reach it.
+        # In its own session, so that Ctrl-C does not reach it.
         command = [sys.executable, "-I", "-S", __file__]
         process = subprocess.Popen(command, stdin=reader, stdout=subprocess.DEVNULL, start_new_session=True)
     except OSError:
-        for descriptor in (before, writer):
+        for descriptor in (original, writer):
             os.close(descriptor)
         raise
     finally:
@@ -61,24 +61,24 @@ def _led_through_a_process(seen: Seen) -> Iterator[None]:
     try:
         yield
     finally:
-        os.dup2(before, 2)  # closes the pipe's last writing end: the process ends
-        os.close(before)
+        os.dup2(original, 2)  # closes the pipe's last writing end, so the process ends
+        os.close(original)
         with contextlib.suppress(subprocess.TimeoutExpired):
-            seen.refused = process.wait(PATIENCE) == REFUSED
+            result.refused = process.wait(PATIENCE) == REFUSED
 
 
 def main() -> int:
-    """Copies standard input to standard error, but for XLA's noise."""
-    refused = dropped = False
+    """Copies standard input to standard error, without XLA's noise."""
+    is_refused = is_dropped = False
     for line in sys.stdin.buffer:
         other_machine = OTHER_MACHINE in line
-        refused |= other_machine and not PREFERENCE.search(line)
-        dropped = other_machine or bool(ALARM.search(line)) or (dropped and not line.strip())
-        if not dropped:
+        is_refused |= other_machine and not PREFERENCE.search(line)
+        is_dropped = other_machine or bool(ALARM.search(line)) or (is_dropped and not line.strip())
+        if not is_dropped:
             with contextlib.suppress(OSError):
                 sys.stderr.buffer.write(line)
                 sys.stderr.buffer.flush()
-    return REFUSED if refused else 0
+    return REFUSED if is_refused else 0
 
 
 if __name__ == "__main__":

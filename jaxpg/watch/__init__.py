@@ -1,1 +1,1 @@
-"""Watching policies instead of reading numbers: reports, comparisons and videos."""
+"""Reports, comparisons and videos."""

@@ -1,4 +1,4 @@
-"""Several runs side by side, as a page, a figure or a table: which method is better, and how sure that is."""
+"""Compares runs, as a page, a figure or a table: which method is better, and how certain that is."""
 
 from __future__ import annotations
 
@@ -9,139 +9,147 @@ from typing import Any
 from jaxpg.errors import UserError
 from jaxpg.store import folder, results
 from jaxpg.store.statistics import (
-    fewest_seeds,
     has_interval,
     improvement_interval,
+    min_seeds,
     probability_of_improvement,
-    spread_name,
+    seed_interval_name,
 )
 from jaxpg.watch import publication
-from jaxpg.watch.curves import PANELS, curve, finite
-from jaxpg.watch.methods import SAME_METHOD, Method, compared_at, methods, standings, task
-from jaxpg.watch.page import page
+from jaxpg.watch.curves import PANELS, make_curve, replace_nonfinite
+from jaxpg.watch.methods import SAME_METHOD, Method, common_steps, compute_standings, read_methods, task_name
+from jaxpg.watch.page import make_page
 
 Json = dict[str, Any]
-MOST = 10  # methods with a colour of their own
+MAX_METHODS = 10  # in the curves: as many as there are colours
 COLUMNS = ["method", "return", "success rate", "seeds", "environment steps"]
 
 
 def write(paths: Sequence[str], out: Path, say: Callable[[str], None]) -> None:
-    """Writes these run folders side by side, in the form that the ending of `out` says, and says what the table says.
+    """Writes the comparison of run folders in the format of the ending of `out`, and prints its table.
 
     Raises:
-      UserError: as `methods`; another ending; or the file cannot be written.
+      UserError: as in `read_methods`; the ending is unknown; or the file cannot be written.
     """
-    form = _form(out)
-    found = methods(paths)
-    folder.replace(out, form(found))
-    rows = [columns(found), *table(found)]
+    writer = _find_writer(out)
+    methods = read_methods(paths)
+    folder.replace(out, writer(methods))
+    rows = [list_columns(methods), *make_table(methods)]
     widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
     for row in rows:
         say("  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip())
-    for line in notes(found):
+    for line in write_notes(methods):
         say(f"note: {line}")
     say(str(out))
 
 
-def _form(out: Path) -> Callable[[Sequence[Method]], str | bytes]:
-    """What writes methods down as the ending says."""
-    forms: dict[str, Callable[[Sequence[Method]], str | bytes]] = {
-        ".html": lambda found: page(comparison(found)),
-        ".pdf": lambda found: publication.figure(found, "pdf"),
-        ".svg": lambda found: publication.figure(found, "svg"),
-        ".csv": publication.csv_table,
+def _find_writer(out: Path) -> Callable[[Sequence[Method]], str | bytes]:
+    """The function that writes methods in the format of the ending."""
+    writers: dict[str, Callable[[Sequence[Method]], str | bytes]] = {
+        ".html": lambda methods: make_page(build_comparison(methods)),
+        ".pdf": lambda methods: publication.draw_figure(methods, "pdf"),
+        ".svg": lambda methods: publication.draw_figure(methods, "svg"),
+        ".csv": publication.format_csv,
     }
-    if out.suffix.lower() not in forms:
-        raise UserError(f"out={out}: must end in {', '.join(forms)}: a page, a figure or a table")
-    return forms[out.suffix.lower()]
+    if out.suffix.lower() not in writers:
+        raise UserError(f"out={out}: must end in {', '.join(writers)}: a page, a figure or a table")
+    return writers[out.suffix.lower()]
 
 
-def comparison(found: Sequence[Method]) -> Json:
-    """What the page shows of some methods, as plain values."""
-    shown, whose = found[:MOST], f"{len(found)} methods" if len(found) > 1 else found[0].label
-    rows = [{"title": "methods, the best first", "columns": columns(found), "rows": table(found), "note": None}]
+def build_comparison(methods: Sequence[Method]) -> Json:
+    """The data of the page for some methods, as plain values."""
+    first, subject = methods[:MAX_METHODS], f"{len(methods)} methods" if len(methods) > 1 else methods[0].label
+    rows = [
+        {
+            "title": "methods, best first",
+            "columns": list_columns(methods),
+            "rows": make_table(methods),
+            "note": None,
+        }
+    ]
     data = {
         "kind": "comparison",
-        "title": f"{whose} on {task(found[0].agents[0])}",
-        "facts": [["score", f"return of the evaluation at {compared_at(found):,} environment steps"]],
+        "title": f"{subject} on {task_name(methods[0].agents[0])}",
+        "facts": [["score", f"return of the evaluation at {common_steps(methods):,} environment steps"]],
         "head": None,
-        "notes": notes(found),
-        "curves": [panel for panel in (_panel(shown, *metric) for metric in PANELS.items()) if panel["series"]],
+        "notes": write_notes(methods),
+        "curves": [panel for panel in (_make_panel(first, *metric) for metric in PANELS.items()) if panel["series"]],
         "diagnostics": [],
         "tables": rows,
-        "improvement": improvement(shown) if len(shown) > 1 else None,
+        "improvement": compare_methods(first) if len(first) > 1 else None,
         **{"player": None, "portrait": None, "workspace": None, "command": None},
-        "configuration": _common(found),
+        "configuration": _list_common_options(methods),
         "versions": [],
     }
-    return finite(data)
+    return replace_nonfinite(data)
 
 
-def columns(found: Sequence[Method]) -> list[str]:
-    """The titles of `table`."""
-    return [name for name in COLUMNS if name != "success rate" or _has_success(found)]
+def list_columns(methods: Sequence[Method]) -> list[str]:
+    """The column titles of `make_table`."""
+    return [name for name in COLUMNS if name != "success rate" or _has_success(methods)]
 
 
-def table(found: Sequence[Method]) -> list[list[str]]:
-    """A row for each method: what `columns` says, with several seeds as `results.score` shows them."""
+def make_table(methods: Sequence[Method]) -> list[list[str]]:
+    """A row for each method, with the columns of `list_columns`; several seeds as in `results.format_score`."""
     rows = []
-    for one in standings(found):
-        rate = "" if one.success is None else results.score(100 * one.success) + " %"
+    for one in compute_standings(methods):
+        rate = "" if one.success is None else results.format_score(100 * one.success) + " %"
         number = str(len(one.method.agents))
-        rows.append([one.method.label, results.score(one.returns), rate, number, f"{one.steps:,}"])
-    return rows if _has_success(found) else [[*row[:2], *row[3:]] for row in rows]
+        rows.append([one.method.label, results.format_score(one.returns), rate, number, f"{one.steps:,}"])
+    return rows if _has_success(methods) else [[*row[:2], *row[3:]] for row in rows]
 
 
-def _has_success(found: Sequence[Method]) -> bool:
-    return any(method.values("eval_success")[0].size for method in found)
+def _has_success(methods: Sequence[Method]) -> bool:
+    return any(method.values("eval_success")[0].size for method in methods)
 
 
-def notes(found: Sequence[Method]) -> list[str]:
-    """What one has to know of the table, a line each: steps that are not equal, seeds that carry no interval."""
-    lines, steps = [], compared_at(found)
-    longer = [f"{method.label} went on to {method.longest:,}" for method in found if method.longest > steps]
+def write_notes(methods: Sequence[Method]) -> list[str]:
+    """Notes on the table: unequal numbers of steps, and too few seeds for an interval."""
+    lines, steps = [], common_steps(methods)
+    longer = [f"{method.label} trained until {method.max_steps:,}" for method in methods if method.max_steps > steps]
     if longer:
-        lines.append(f"compared at {steps:,} environment steps, the most that all have reached; {', '.join(longer)}")
-    apart = [f"{one.method.label} at {one.steps:,}" for one in standings(found) if one.steps != steps]
-    if apart:
-        lines.append(f"not evaluated at {steps:,} steps, but near it: {', '.join(apart)}")
-    if any(not has_interval(len(method.agents)) for method in found):
-        around = f"; in parentheses: {spread_name(2)}" if any(_is_few(len(one.agents)) for one in found) else ""
-        lines.append(f"fewer than {fewest_seeds()} seeds carry no 95 % interval{around}")
+        lines.append(f"compared at {steps:,} environment steps, which all have reached; {', '.join(longer)}")
+    nearby = [f"{one.method.label} at {one.steps:,}" for one in compute_standings(methods) if one.steps != steps]
+    if nearby:
+        lines.append(f"not evaluated at {steps:,} steps, but nearby: {', '.join(nearby)}")
+    if any(not has_interval(len(method.agents)) for method in methods):
+        has_range = any(_is_few(len(method.agents)) for method in methods)
+        range_note = f"; in parentheses: {seed_interval_name(2)}" if has_range else ""
+        lines.append(f"a 95 % interval needs at least {min_seeds()} seeds{range_note}")
     return lines
 
 
 def _is_few(number: int) -> bool:
-    """Whether so many seeds differ, but carry no interval."""
+    """Whether there are several seeds, but too few for an interval."""
     return number > 1 and not has_interval(number)
 
 
-def _panel(found: Sequence[Method], metric: str, title: str) -> Json:
-    series = [curve(method.label, *method.values(metric)) for method in found if method.values(metric)[0].size]
+def _make_panel(methods: Sequence[Method], metric: str, title: str) -> Json:
+    series = [make_curve(method.label, *method.values(metric)) for method in methods if method.values(metric)[0].size]
     return {"title": title, "x": "environment steps", "references": [], "series": series}
 
 
-def improvement(found: Sequence[Method]) -> Json:
-    """How probable it is that a run of the method of a row is better than one of the column's, with 95 % intervals.
+def compare_methods(methods: Sequence[Method]) -> Json:
+    """The probability that a run of the row's method is better than one of the column's, with 95 % intervals.
 
-    An interval is NaN where the seeds are too few for one.
+    An interval is NaN if there are too few seeds for one.
     """
-    scores = [one.returns for one in standings(found)]
+    scores = [one.returns for one in compute_standings(methods)]
     pairs = [[None if a is b else (a, b) for b in scores] for a in scores]
     intervals = [[pair and improvement_interval(*pair) for pair in row] for row in pairs]
     return {
-        "labels": [method.label for method in found],
+        "labels": [method.label for method in methods],
         "probability": [[pair and probability_of_improvement(*pair) for pair in row] for row in pairs],
         "low": [[interval and interval[0] for interval in row] for row in intervals],
         "high": [[interval and interval[1] for interval in row] for row in intervals],
     }
 
 
-def _common(found: Sequence[Method]) -> list[list[str]]:
-    """The options that are the same in all methods."""
-    every = [method.agents[0].options for method in found]
+def _list_common_options(methods: Sequence[Method]) -> list[list[str]]:
+    """The options that all methods share."""
+    options = [method.agents[0].options for method in methods]
     return [
         [name, str(value)]
-        for name, value in every[0].items()
-        if name not in SAME_METHOD and all(name in one and one[name] == value for one in every)
+        for name, value in options[0].items()
+        if name not in SAME_METHOD and all(name in one and one[name] == value for one in options)
     ]

@@ -1,4 +1,4 @@
-"""Learning curves as plain values for the page."""
+"""Data of learning curves for the page."""
 
 from __future__ import annotations
 
@@ -10,12 +10,12 @@ import numpy as np
 
 from jaxpg.config.configuration import Config
 from jaxpg.store import results
-from jaxpg.store.statistics import interquartile_mean, spread, spread_name
+from jaxpg.store.statistics import interquartile_mean, seed_interval, seed_interval_name
 from jaxpg.watch import figures
 
 Json = dict[str, Any]
 PANELS = {"eval_return": "return", "eval_success": "success rate"}  # metric -> title
-# Means over the updates between two lines of metrics, where the algorithm has such a thing.
+# Means over the updates between two lines of metrics, if the algorithm reports them.
 DIAGNOSTICS = {
     "kl": "KL divergence of an update",
     "entropy": "entropy of the policy",
@@ -26,39 +26,44 @@ DIAGNOSTICS = {
 POLICY, TRAINING = "deterministic policy", "while training"
 
 
-def curves(config: Config, lines: Sequence[Json], references: Mapping[str, float]) -> list[Json]:
-    """A panel for return and success: of the settings of a sweep, or while training and of the deterministic policy.
+def make_curves(config: Config, lines: Sequence[Json], references: Mapping[str, float]) -> list[Json]:
+    """Panels for return and success: for the settings of a sweep, or during training and of the deterministic policy.
 
     Args:
-      config, lines: of the run.
-      references: returns to compare with, by what they are.
+      config, lines: configuration and metrics of the run.
+      references: label -> return to compare with.
     """
     panels = []
     for name, title in PANELS.items():
-        drawn = [(label, name, chosen) for label, chosen in _agents(config, lines, POLICY).items()]
+        entries = [(label, name, agents) for label, agents in _select_agents(config, lines, POLICY).items()]
         if not config.sweep and name == "eval_return":
-            drawn.append((TRAINING, "return", slice(None)))
-        panels.append(_panel(title, [curve(label, *figures.series(lines, *which)) for label, *which in drawn]))
+            entries.append((TRAINING, "return", slice(None)))
+        panels.append(
+            _make_panel(title, [make_curve(label, *figures.select_series(lines, *which)) for label, *which in entries])
+        )
     panels[0]["references"] = [{"label": label, "value": value} for label, value in references.items()]
     return [panel for panel in panels if panel["series"]]
 
 
-def diagnostics(config: Config, lines: Sequence[Json]) -> list[Json]:
-    """A panel for each of `DIAGNOSTICS` that was measured: of the settings of a sweep, or of the one there is."""
-    agents = _agents(config, lines, TRAINING)
-    found = [
-        _panel(title, [curve(label, *figures.series(lines, name, chosen)) for label, chosen in agents.items()])
+def make_diagnostics(config: Config, lines: Sequence[Json]) -> list[Json]:
+    """A panel for each of the `DIAGNOSTICS` in the metrics, with a curve for each setting of a sweep."""
+    agents = _select_agents(config, lines, TRAINING)
+    panels = [
+        _make_panel(
+            title,
+            [make_curve(label, *figures.select_series(lines, name, selected)) for label, selected in agents.items()],
+        )
         for name, title in DIAGNOSTICS.items()
     ]
-    return [panel for panel in found if panel["series"]]
+    return [panel for panel in panels if panel["series"]]
 
 
-def _agents(config: Config, lines: Sequence[Json], otherwise: str) -> dict[str, slice]:
+def _select_agents(config: Config, lines: Sequence[Json], label: str) -> dict[str, slice]:
     """The agents of each curve by its label."""
-    return results.curves(config, lines) if config.sweep else {otherwise: slice(None)}
+    return results.select_curves(config, lines) if config.sweep else {label: slice(None)}
 
 
-def _panel(title: str, series: Sequence[Json]) -> Json:
+def _make_panel(title: str, series: Sequence[Json]) -> Json:
     return {
         "title": title,
         "x": "environment steps",
@@ -67,29 +72,29 @@ def _panel(title: str, series: Sequence[Json]) -> Json:
     }
 
 
-def curve(label: str, steps: np.ndarray, values: np.ndarray) -> Json:
-    """One curve; of several agents, `[S, K]`, their interquartile mean and its `spread`."""
-    several = len(values) > 1 and len(steps)
-    low, high = spread(values) if several else (None, None)
+def make_curve(label: str, steps: np.ndarray, values: np.ndarray) -> Json:
+    """One curve; for several agents, `[S, K]`, their interquartile mean and its `seed_interval`."""
+    has_interval = len(values) > 1 and len(steps)
+    low, high = seed_interval(values) if has_interval else (None, None)
     return {
         "label": label,
         "steps": steps.tolist(),
-        "mean": numbers(interquartile_mean(values)),
-        "low": numbers(low) if several else None,
-        "high": numbers(high) if several else None,
-        "band": f"{len(values)} seeds, {spread_name(len(values))}" if several else None,
+        "mean": round_numbers(interquartile_mean(values)),
+        "low": round_numbers(low) if has_interval else None,
+        "high": round_numbers(high) if has_interval else None,
+        "band": f"{len(values)} seeds, {seed_interval_name(len(values))}" if has_interval else None,
     }
 
 
-def numbers(values: np.ndarray) -> list[Any]:
-    """Nested lists of numbers with four digits: pictures need no more."""
+def round_numbers(values: np.ndarray) -> list[Any]:
+    """Nested lists of numbers rounded to four digits, enough for pictures."""
     return np.vectorize(lambda x: float(f"{x:.4g}"), otypes=[float])(values).tolist()
 
 
-def finite(value: Any) -> Any:
-    """The same nested values, with None for every number that is not finite, as JSON has none."""
+def replace_nonfinite(value: Any) -> Any:
+    """The nested values with None for numbers that are not finite, which JSON lacks."""
     if isinstance(value, dict):
-        return {name: finite(x) for name, x in value.items()}
+        return {name: replace_nonfinite(x) for name, x in value.items()}
     if isinstance(value, (list, tuple)):
-        return [finite(x) for x in value]
+        return [replace_nonfinite(x) for x in value]
     return None if isinstance(value, float) and not math.isfinite(value) else value

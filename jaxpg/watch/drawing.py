@@ -1,7 +1,7 @@
-"""A robot in the plane: the geoms of a MuJoCo model in outline, seen by a camera without perspective.
+"""Draws a robot in the plane: outlines of the geoms of a MuJoCo model, seen by an orthographic camera.
 
-What the camera sees of a point p is (right . p, up . p). The outline of a geom is the convex hull of some of its points
-with a rim around it: two points and a radius are a capsule, eight corners without a rim a box.
+The camera maps a point p to (right . p, up . p). The outline of a geom is the convex hull of some of its points with a
+rim around it: two points and a radius make a capsule, eight corners without a rim a box.
 """
 
 from __future__ import annotations
@@ -14,23 +14,23 @@ import numpy as np
 
 from jaxpg.watch.attempts import NotDrawn
 
-SIDE = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])  # of models without a camera
-FAR = 4.0  # a robot that travels this many times its own size is followed
-BEYOND = 20.0  # of the model's size: what is farther away is drawn there
-ROUND = 16  # points of a circle
-DIRECTIONS = 64  # in which a mesh's or an ellipsoid's outermost points are looked for
-BARE = "#9aa5b3"  # of a body without geoms
+SIDE = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])  # for models without a camera
+TRAVEL = 4.0  # a robot that travels this many times its own size is kept in the middle
+MAX_REACH = 20.0  # times the model's size: anything farther away is drawn there
+CIRCLE_POINTS = 16
+NUM_DIRECTIONS = 64  # in which the outermost points of a mesh or an ellipsoid are searched
+BODY_COLOR = "#9aa5b3"  # for bodies, in models without geoms
 CORNERS = np.array([(x, y, z) for x in (-1.0, 1.0) for y in (-1.0, 1.0) for z in (-1.0, 1.0)])
 AXES = ("x", "y", "z")
 
 
 class Motor(NamedTuple):
-    """A hinge that is driven, and that the camera sees turn.
+    """A driven hinge whose turning the camera sees.
 
     Attributes:
-      command: which of the model's actuators it is.
-      joint: the hinge's number in the model.
-      sign: 1 where a positive command turns it counter-clockwise, as the camera sees it, else -1.
+      command: index of the actuator in the model.
+      joint: index of the hinge in the model.
+      sign: 1 if a positive command turns it counter-clockwise in the picture, else -1.
     """
 
     command: int
@@ -39,12 +39,12 @@ class Motor(NamedTuple):
 
 
 class Part(NamedTuple):
-    """A geom, or a body that has none.
+    """A geom, or a body in a model without geoms.
 
     Attributes:
-      number: the geom's or the body's in the model.
-      points: whose convex hull it is, in its own frame, `[K, 3]` [m].
-      radius: of the rim around them [m].
+      number: index of the geom or the body in the model.
+      points: points that span its convex hull, in its own frame, `[K, 3]` [m].
+      radius: width of the rim around them [m].
       color: such as `#cc4c4c`.
     """
 
@@ -60,8 +60,8 @@ class Picture(NamedTuple):
     Attributes:
       model: the model.
       axes: right, up and towards the viewer, `[3, 3]`.
-      parts: the farthest first.
-      of_bodies: whether they are bodies, each as the box that has its inertia; else geoms.
+      parts: farthest first.
+      of_bodies: whether the parts are bodies, drawn as boxes with their inertia, instead of geoms.
       motors: the driven hinges.
     """
 
@@ -88,35 +88,37 @@ class Frames(NamedTuple):
     goal: np.ndarray | None
 
 
-def picture(model: Any) -> Picture:
-    """The geoms of a model without planes and height fields, and its driven hinges.
+def make_picture(model: Any) -> Picture:
+    """The geoms of a model, without planes and height fields, and its driven hinges.
 
-    Those that are visible are drawn; where none is, as in models of which the visual geoms were removed, all; and where
-    there is none at all, the bodies.
+    Draws the visible geoms; if none is visible, as when visual geoms were removed, all of them; and if there are none,
+    the bodies.
 
     Raises:
-      NotDrawn: there is no body either.
+      NotDrawn: there are no bodies either.
     """
-    axes, data = camera(model), mujoco.MjData(model)
+    axes, data = camera_axes(model), mujoco.MjData(model)
     mujoco.mj_kinematics(model, data)
     mujoco.mj_comPos(model, data)
-    geoms = drawn_geoms(model)
-    parts = [Part(i, *_outline(model, i), _color(_rgba(model, i))) for i in geoms] or _bodies(model)
+    geoms = find_geoms(model)
+    parts = [Part(i, *_make_outline(model, i), _format_color(_find_rgba(model, i))) for i in geoms] or _make_bodies(
+        model
+    )
     if not parts:
         raise NotDrawn("the model has no geoms and no bodies")
     depth = (data.geom_xpos if geoms else data.xipos) @ axes[2]
     parts.sort(key=lambda part: round(float(depth[part.number]), 6))
-    return Picture(model, axes, parts, not geoms, _motors(model, axes))
+    return Picture(model, axes, parts, not geoms, _find_motors(model, axes))
 
 
-def drawn_geoms(model: Any) -> list[int]:
-    """The visible ones; where there is none, all; planes and height fields left out."""
-    endless = (mujoco.mjtGeom.mjGEOM_PLANE, mujoco.mjtGeom.mjGEOM_HFIELD)
-    drawn = [int(i) for i in np.flatnonzero(~np.isin(model.geom_type, endless)) if _rgba(model, i)[3]]
-    return [i for i in drawn if model.geom_group[i] < 3] or drawn
+def find_geoms(model: Any) -> list[int]:
+    """The visible geoms, or all if none is visible; without planes and height fields."""
+    unbounded = (mujoco.mjtGeom.mjGEOM_PLANE, mujoco.mjtGeom.mjGEOM_HFIELD)
+    geoms = [int(i) for i in np.flatnonzero(~np.isin(model.geom_type, unbounded)) if _find_rgba(model, i)[3]]
+    return [i for i in geoms if model.geom_group[i] < 3] or geoms
 
 
-def _outline(model: Any, geom: int) -> tuple[np.ndarray, float]:
+def _make_outline(model: Any, geom: int) -> tuple[np.ndarray, float]:
     """Points `[K, 3]` in the geom's frame, and the radius around them."""
     kind, size = model.geom_type[geom], model.geom_size[geom]
     if kind == mujoco.mjtGeom.mjGEOM_SPHERE:
@@ -124,51 +126,51 @@ def _outline(model: Any, geom: int) -> tuple[np.ndarray, float]:
     if kind == mujoco.mjtGeom.mjGEOM_CAPSULE:
         return np.array([[0, 0, -size[1]], [0, 0, size[1]]]), float(size[0])
     if kind == mujoco.mjtGeom.mjGEOM_CYLINDER:
-        angle = np.linspace(0, 2 * np.pi, ROUND, endpoint=False)
+        angle = np.linspace(0, 2 * np.pi, CIRCLE_POINTS, endpoint=False)
         ends = [
             np.stack([size[0] * np.cos(angle), size[0] * np.sin(angle), 0 * angle + z]) for z in (-size[1], size[1])
         ]
         return np.concatenate(ends, axis=1).T, 0.0
     if kind == mujoco.mjtGeom.mjGEOM_ELLIPSOID:
-        return size * _directions(), 0.0
+        return size * _make_directions(), 0.0
     if kind == mujoco.mjtGeom.mjGEOM_MESH:
-        return _outermost(model, int(model.geom_dataid[geom])), 0.0
+        return _find_outermost(model, int(model.geom_dataid[geom])), 0.0
     return model.geom_aabb[geom, :3] + CORNERS * model.geom_aabb[geom, 3:], 0.0
 
 
-def _directions() -> np.ndarray:
+def _make_directions() -> np.ndarray:
     """Unit vectors spread evenly over the sphere, on a spiral, `[DIRECTIONS, 3]`."""
-    height = 1 - (2 * np.arange(DIRECTIONS) + 1) / DIRECTIONS
-    angle, around = np.pi * (3 - np.sqrt(5)) * np.arange(DIRECTIONS), np.sqrt(1 - height**2)
+    height = 1 - (2 * np.arange(NUM_DIRECTIONS) + 1) / NUM_DIRECTIONS
+    angle, around = np.pi * (3 - np.sqrt(5)) * np.arange(NUM_DIRECTIONS), np.sqrt(1 - height**2)
     return np.stack([around * np.cos(angle), around * np.sin(angle), height], axis=1)
 
 
-def _outermost(model: Any, mesh: int) -> np.ndarray:
-    """The vertices of a mesh that are the farthest in some direction."""
+def _find_outermost(model: Any, mesh: int) -> np.ndarray:
+    """The vertices of a mesh that are farthest in some direction."""
     first = model.mesh_vertadr[mesh]
     vertices = model.mesh_vert[first : first + model.mesh_vertnum[mesh]]
-    return vertices[np.unique(np.argmax(vertices @ _directions().T, axis=0))].astype(float)
+    return vertices[np.unique(np.argmax(vertices @ _make_directions().T, axis=0))].astype(float)
 
 
-def _bodies(model: Any) -> list[Part]:
-    """Boxes of even density with the mass and inertia of the bodies, as MuJoCo's viewer has them.
+def _make_bodies(model: Any) -> list[Part]:
+    """Boxes of uniform density with the mass and inertia of the bodies, as in MuJoCo's viewer.
 
-    I_x = m (b^2 + c^2) / 3 of a box with half sides a, b, c: a = sqrt(3 (I_y + I_z - I_x) / (2 m))
+    A box with half sides a, b, c has I_x = m (b^2 + c^2) / 3, so a = sqrt(3 (I_y + I_z - I_x) / (2 m))
     """
     parts = []
     for body in np.flatnonzero(model.body_mass > 0):
         inertia, mass = model.body_inertia[body], model.body_mass[body]
         half = np.sqrt(np.maximum(1.5 * (inertia.sum() - 2 * inertia) / mass, 0))
-        parts.append(Part(int(body), CORNERS * half, 0.0, BARE))
+        parts.append(Part(int(body), CORNERS * half, 0.0, BODY_COLOR))
     return parts
 
 
-def _color(rgba: np.ndarray) -> str:
+def _format_color(rgba: np.ndarray) -> str:
     return "#" + "".join(f"{round(255 * float(np.clip(x, 0, 1))):02x}" for x in rgba[:3])
 
 
-def camera(model: Any) -> np.ndarray:
-    """Right, up and towards the viewer, `[3, 3]`: the axes of the model's first camera, or a look from the side."""
+def camera_axes(model: Any) -> np.ndarray:
+    """Right, up and towards the viewer, `[3, 3]`: axes of the model's first camera, or a view from the side."""
     if model.ncam == 0:
         return SIDE
     data = mujoco.MjData(model)
@@ -178,84 +180,86 @@ def camera(model: Any) -> np.ndarray:
     return data.cam_xmat[0].reshape(3, 3).T
 
 
-def _rgba(model: Any, geom: int) -> np.ndarray:
+def _find_rgba(model: Any, geom: int) -> np.ndarray:
     material = model.geom_matid[geom]
     return model.geom_rgba[geom] if material < 0 else model.mat_rgba[material]
 
 
-def _motors(model: Any, axes: np.ndarray) -> list[Motor]:
-    """The driven hinges whose axis points to the viewer or away."""
+def _find_motors(model: Any, axes: np.ndarray) -> list[Motor]:
+    """The driven hinges whose axis points towards the viewer or away."""
     data = mujoco.MjData(model)
     mujoco.mj_kinematics(model, data)
-    found = []
+    motors = []
     for command, (joint, _) in enumerate(model.actuator_trnid):
         if model.actuator_trntype[command] != mujoco.mjtTrn.mjTRN_JOINT:
             continue
         towards = float(data.xaxis[joint] @ axes[2])
         if model.jnt_type[joint] == mujoco.mjtJoint.mjJNT_HINGE and abs(towards) > 0.9:
-            found.append(Motor(command, int(joint), 1 if towards > 0 else -1))
-    return found
+            motors.append(Motor(command, int(joint), 1 if towards > 0 else -1))
+    return motors
 
 
 def axis_labels(axes: np.ndarray) -> tuple[str, str]:
-    """What a picture shows to the right and upwards: an axis of the world, or what the camera calls so.
+    """Labels of a picture's horizontal and vertical axis: an axis of the world, or else a direction.
 
     >>> axis_labels(SIDE), axis_labels(-SIDE), axis_labels(np.array([[0.8, 0.6, 0.0], [0.0, 0.0, 1.0]]))
     (('x [m]', 'z [m]'), ('\u2212x [m]', '\u2212z [m]'), ('to the right [m]', 'z [m]'))
     """
     names = []
-    for direction, otherwise in zip(axes[:2], ("to the right", "upwards"), strict=True):
-        along = int(np.argmax(np.abs(direction)))
-        sign = "" if direction[along] > 0 else "\u2212"
-        names.append(f"{sign}{AXES[along]} [m]" if abs(direction[along]) > 1 - 1e-6 else f"{otherwise} [m]")
+    for direction, default in zip(axes[:2], ("to the right", "upwards"), strict=True):
+        axis = int(np.argmax(np.abs(direction)))
+        sign = "" if direction[axis] > 0 else "\u2212"
+        names.append(f"{sign}{AXES[axis]} [m]" if abs(direction[axis]) > 1 - 1e-6 else f"{default} [m]")
     return names[0], names[1]
 
 
 def draw(picture: Picture, qpos: np.ndarray, goal: np.ndarray | None = None) -> Frames:
-    """What the camera sees of the joint positions `[F, nq]`, and of the goal `[F, 3]`, which stays where it is.
+    """What the camera sees at the joint positions `[F, nq]`, and of the goal `[F, 3]`, which does not move.
 
-    A robot that travels is drawn in the middle; one whose position is not finite stays where it was.
+    A robot that travels is kept in the middle. Positions that are not finite are replaced by the previous ones.
     """
     model, data = picture.model, mujoco.MjData(picture.model)
     joints, numbers = [motor.joint for motor in picture.motors], [part.number for part in picture.parts]
     place, turn = np.zeros((len(qpos), len(numbers), 3)), np.zeros((len(qpos), len(numbers), 3, 3))
     anchors = np.zeros((len(qpos), len(joints), 3))
-    for i, q in enumerate(_held(qpos, model.qpos0)):
+    for i, q in enumerate(_fill_gaps(qpos, model.qpos0)):
         data.qpos = q
         mujoco.mj_kinematics(model, data)
-        mujoco.mj_comPos(model, data)  # where the bodies' inertias are
-        found, turned = (data.xipos, data.ximat) if picture.of_bodies else (data.geom_xpos, data.geom_xmat)
-        place[i], turn[i] = found[numbers], turned[numbers].reshape(-1, 3, 3)
+        mujoco.mj_comPos(model, data)  # for the centres of the bodies
+        positions, rotations = (data.xipos, data.ximat) if picture.of_bodies else (data.geom_xpos, data.geom_xmat)
+        place[i], turn[i] = positions[numbers], rotations[numbers].reshape(-1, 3, 3)
         anchors[i] = data.xanchor[joints]
     plane = picture.axes[:2]
-    frames = Frames(place @ plane.T, plane @ turn, anchors @ plane.T, None if goal is None else _seen_goal(plane, goal))
-    return _in_the_middle(picture, frames)
+    frames = Frames(
+        place @ plane.T, plane @ turn, anchors @ plane.T, None if goal is None else _project_goal(plane, goal)
+    )
+    return _center(picture, frames)
 
 
-def _held(qpos: np.ndarray, first: np.ndarray) -> Iterator[np.ndarray]:
-    """Each position, or the last one before it that is finite."""
+def _fill_gaps(qpos: np.ndarray, first: np.ndarray) -> Iterator[np.ndarray]:
+    """Each position, or the last finite one before it."""
     for q in qpos:
         first = q if np.isfinite(q).all() else first
         yield first
 
 
-def _seen_goal(plane: np.ndarray, goal: np.ndarray) -> np.ndarray | None:
+def _project_goal(plane: np.ndarray, goal: np.ndarray) -> np.ndarray | None:
     return plane @ goal[0] if np.isfinite(goal[0]).all() else None
 
 
-def points(picture: Picture, frames: Frames) -> np.ndarray:
-    """The points of all parts, whose hulls are drawn, `[F, K, 2]`."""
-    each = [
+def outline_points(picture: Picture, frames: Frames) -> np.ndarray:
+    """The points of all parts, `[F, K, 2]`."""
+    part_points = [
         frames.place[:, i, None] + np.einsum("fij,kj->fki", frames.turn[:, i], part.points)
         for i, part in enumerate(picture.parts)
     ]
-    return np.concatenate(each, axis=1)
+    return np.concatenate(part_points, axis=1)
 
 
-def _in_the_middle(picture: Picture, frames: Frames) -> Frames:
-    """With a robot that travels in the middle of the picture, and nothing farther away than can be seen."""
-    middle = followed(points(picture, frames))
-    reach = BEYOND * max(float(picture.model.stat.extent), 1.0)
+def _center(picture: Picture, frames: Frames) -> Frames:
+    """Keeps a travelling robot in the middle of the picture, and everything within `MAX_REACH`."""
+    middle = find_center(outline_points(picture, frames))
+    reach = MAX_REACH * max(float(picture.model.stat.extent), 1.0)
     center = picture.axes[:2] @ picture.model.stat.center
     place, motors = (
         np.clip(x - middle[:, None], center - reach, center + reach) for x in (frames.place, frames.motors)
@@ -263,27 +267,27 @@ def _in_the_middle(picture: Picture, frames: Frames) -> Frames:
     return frames._replace(place=place, motors=motors)
 
 
-def followed(points: np.ndarray) -> np.ndarray:
-    """Where the middle of the picture is in each frame, `[F, 2]`: with a robot that travels, else at the origin."""
+def find_center(points: np.ndarray) -> np.ndarray:
+    """The middle of the picture in each frame, `[F, 2]`: it follows a travelling robot, else it is the origin."""
     place = np.zeros((len(points), 2))
-    if np.ptp(points[..., 0]) > FAR * np.ptp(points, axis=1).max():
+    if np.ptp(points[..., 0]) > TRAVEL * np.ptp(points, axis=1).max():
         place[:, 0] = points[..., 0].mean(axis=1)
     return place
 
 
 def extent(picture: Picture, frames: list[Frames], margin: float) -> list[float]:
-    """The rectangle that holds all that is drawn: x_min, y_min, x_max, y_max.
+    """The rectangle around everything that is drawn: x_min, y_min, x_max, y_max.
 
     Args:
       picture: what is drawn.
-      frames: to be drawn in the same rectangle.
-      margin: what is left around them, as a fraction of the larger side.
+      frames: frames that share the rectangle.
+      margin: margin around them, as a fraction of the larger side.
     """
     rim = np.repeat([part.radius for part in picture.parts], [len(part.points) for part in picture.parts])[:, None]
-    drawn = [points(picture, one) for one in frames]
-    corners = [(one + sign * rim).reshape(-1, 2) for one in drawn for sign in (-1, 1)]
+    outlines = [outline_points(picture, one) for one in frames]
+    corners = [(one + sign * rim).reshape(-1, 2) for one in outlines for sign in (-1, 1)]
     corners += [one.goal[None] for one in frames if one.goal is not None]
     low, high = np.concatenate(corners).min(axis=0), np.concatenate(corners).max(axis=0)
     size = float(np.max(high - low))
-    room = margin * size if size else 1.0  # around a single point
-    return [*(low - room).tolist(), *(high + room).tolist()]
+    space = margin * size if size else 1.0  # around a single point
+    return [*(low - space).tolist(), *(high + space).tolist()]

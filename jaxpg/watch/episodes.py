@@ -1,4 +1,4 @@
-"""Complete episodes of a stored policy, in its own environment or in Gymnasium's."""
+"""Plays complete episodes of a stored policy, in its own environment or in Gymnasium's."""
 
 from __future__ import annotations
 
@@ -12,18 +12,18 @@ import envs
 from envs.hints import pip_install
 from jaxpg.errors import UserError
 from jaxpg.evaluation import evaluate
-from jaxpg.store.names import own_metrics
+from jaxpg.store.names import rename_metrics
 from jaxpg.store.policies import StoredPolicy
-from jaxpg.store.statistics import counted_returns
+from jaxpg.store.statistics import penalize_diverged
 
 
 class Results(NamedTuple):
-    """N episodes.
+    """Results of N episodes.
 
     Attributes:
-      returns: at what they count (`counted_returns`), `[N]`.
-      diverged: whether the physics did, `[N]` of bool.
-      metrics: the environment's, of the last step, `[N]` by their names among ours (`own_metrics`).
+      returns: returns, with diverged episodes penalized (`penalize_diverged`), `[N]`.
+      diverged: whether the physics diverged, `[N]` of bool.
+      metrics: metrics of the environment at the last step, `[N]` by their logged names (`rename_metrics`).
     """
 
     returns: np.ndarray
@@ -31,7 +31,7 @@ class Results(NamedTuple):
     metrics: dict[str, np.ndarray]
 
 
-def play_own(stored: StoredPolicy, num_episodes: int, seed: int) -> Results:
+def play_native(stored: StoredPolicy, num_episodes: int, seed: int) -> Results:
     """Episodes in the environment that the policy was trained on; the seed fixes the starts."""
 
     @jax.jit
@@ -40,15 +40,15 @@ def play_own(stored: StoredPolicy, num_episodes: int, seed: int) -> Results:
         return evaluate(stored.env, act, jax.random.split(key, num_episodes), stored.config.env.episode_length)
 
     episodes = jax.tree.map(np.asarray, play(stored.policy, jax.random.key(seed)))
-    returns = counted_returns(episodes.episode_return, episodes.diverged)
-    return Results(returns, episodes.diverged, own_metrics(episodes.metrics))
+    returns = penalize_diverged(episodes.episode_return, episodes.diverged)
+    return Results(returns, episodes.diverged, rename_metrics(episodes.metrics))
 
 
 def play_gymnasium(stored: StoredPolicy, num_episodes: int, seed: int) -> Results:
     """Episodes in Gymnasium's Pendulum-v1, started with the seeds seed, seed + 1, ...
 
     Raises:
-      UserError: another environment than the pendulum with Gymnasium's constants, or Gymnasium is not installed.
+      UserError: the environment is not the pendulum with Gymnasium's constants, or Gymnasium is not installed.
     """
     if stored.config.choices["env"] != "pendulum" or stored.config.env != envs.REGISTRY["pendulum"].config():
         raise UserError("backend=gymnasium plays Pendulum-v1: it takes runs of env=pendulum with its default options")

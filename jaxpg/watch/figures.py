@@ -1,4 +1,4 @@
-"""Pictures of a run."""
+"""Figures of a run."""
 
 from __future__ import annotations
 
@@ -7,51 +7,53 @@ from typing import Any, BinaryIO
 
 import numpy as np
 
-from jaxpg.store.statistics import interquartile_mean, spread, spread_name
+from jaxpg.store.statistics import interquartile_mean, seed_interval, seed_interval_name
 
-# Of the curves, as on the page of the run (jaxpg/watch/page/page.css), so that a colour means the same in both.
+# Colours of the curves, the same as on the page of the run (jaxpg/watch/page/page.css).
 COLORS = ("#0072b2", "#d55e00", "#009e73", "#b35c93", "#c78500", "#3f9fd8", "#4a525c")
 
 
-def learning_curve(lines: Sequence[dict[str, Any]], file: BinaryIO, title: str) -> None:
-    """Return, and success where there is one, over environment steps.
+def draw_learning_curve(lines: Sequence[dict[str, Any]], file: BinaryIO, title: str) -> None:
+    """Draws the return, and the success rate if there is one, over environment steps.
 
     Args:
-      lines: of `metrics.jsonl`; values of several agents are lists, drawn as their interquartile mean and `spread`.
+      lines: lines of `metrics.jsonl`; lists, one value per agent, are drawn as interquartile mean and `seed_interval`.
       file: takes the PNG.
-      title: above the picture.
+      title: title of the figure.
     """
-    figure, panels = _panels(lines, title)
+    figure, panels = _make_panels(lines, title)
     for name, axes in panels.items():
-        draw_curve(axes, *series(lines, name), "deterministic policy")
-    draw_curve(panels["eval_return"], *series(lines, "return"), "while training")
+        draw_curve(axes, *select_series(lines, name), "deterministic policy")
+    draw_curve(panels["eval_return"], *select_series(lines, "return"), "while training")
     for axes in panels.values():
         axes.legend()
     figure.savefig(file, dpi=120)
 
 
-def sweep_curves(lines: Sequence[dict[str, Any]], file: BinaryIO, title: str, settings: Mapping[str, slice]) -> None:
-    """Return of the deterministic policy, and success where there is one, over environment steps: a curve a setting.
+def draw_sweep_curves(
+    lines: Sequence[dict[str, Any]], file: BinaryIO, title: str, settings: Mapping[str, slice]
+) -> None:
+    """As `draw_learning_curve`, for the deterministic policies of a sweep: one curve per setting.
 
     Args:
-      lines, file, title: as in `learning_curve`.
-      settings: label -> its agents, in the order of the legend.
+      lines, file, title: as in `draw_learning_curve`.
+      settings: label -> agents, in the order of the legend.
     """
-    figure, panels = _panels(lines, f"{title}, deterministic policy")
+    figure, panels = _make_panels(lines, f"{title}, deterministic policy")
     for name, axes in panels.items():
         for label, agents in settings.items():
-            _draw(axes, *series(lines, name, agents), label)
+            _draw(axes, *select_series(lines, name, agents), label)
     number = max(agents.stop - agents.start for agents in settings.values())
     handles, labels = panels["eval_return"].get_legend_handles_labels()
-    title = f"interquartile mean of {number} seeds,\n{spread_name(number)}" if number > 1 else None
+    title = f"interquartile mean of {number} seeds,\n{seed_interval_name(number)}" if number > 1 else None
     legend = figure.legend(handles, labels, loc="outside right center", title=title, fontsize=8, title_fontsize=8)
-    # Beside the panels, which keep their size.
+    # The legend goes next to the panels, which keep their size.
     figure.set_figwidth(figure.get_figwidth() + legend.get_window_extent().width / figure.dpi)
     figure.savefig(file, dpi=120)
 
 
-def _panels(lines: Sequence[dict[str, Any]], title: str) -> tuple[Any, dict[str, Any]]:
-    """An empty figure, and its axes by the name of the metric that they are for."""
+def _make_panels(lines: Sequence[dict[str, Any]], title: str) -> tuple[Any, dict[str, Any]]:
+    """An empty figure, and its axes by metric."""
     from matplotlib.figure import Figure
 
     ylabels = {"eval_return": "return"}
@@ -67,8 +69,10 @@ def _panels(lines: Sequence[dict[str, Any]], title: str) -> tuple[Any, dict[str,
     return figure, panels
 
 
-def series(lines: Sequence[dict[str, Any]], name: str, agents: slice = slice(None)) -> tuple[np.ndarray, np.ndarray]:
-    """Steps `[K]` and values `[S, K]` of the lines where each of the agents has a value."""
+def select_series(
+    lines: Sequence[dict[str, Any]], name: str, agents: slice = slice(None)
+) -> tuple[np.ndarray, np.ndarray]:
+    """Steps `[K]` and values `[S, K]` of the lines in which all of the agents have a value."""
     points = [(line["steps"], np.atleast_1d(line[name])[agents]) for line in lines if name in line]
     points = [(steps, values) for steps, values in points if all(value is not None for value in values)]
     if not points:
@@ -77,15 +81,15 @@ def series(lines: Sequence[dict[str, Any]], name: str, agents: slice = slice(Non
 
 
 def draw_curve(axes: Any, steps: np.ndarray, values: np.ndarray, label: str) -> None:
-    """One curve; of several agents their interquartile mean with its `spread`."""
-    _draw(axes, steps, values, f"{label}: {_of_seeds(len(values))}" if len(values) > 1 and len(steps) else label)
+    """Draws one curve; for several agents, their interquartile mean with its `seed_interval`."""
+    _draw(axes, steps, values, f"{label}: {_describe_seeds(len(values))}" if len(values) > 1 and len(steps) else label)
 
 
 def _draw(axes: Any, steps: np.ndarray, values: np.ndarray, label: str) -> None:
     (line,) = axes.plot(steps, interquartile_mean(values), label=label)
     if len(values) > 1 and len(steps):
-        axes.fill_between(steps, *spread(values), color=line.get_color(), alpha=0.2, linewidth=0)
+        axes.fill_between(steps, *seed_interval(values), color=line.get_color(), alpha=0.2, linewidth=0)
 
 
-def _of_seeds(number: int) -> str:
-    return f"interquartile mean of {number} seeds, {spread_name(number)}"
+def _describe_seeds(number: int) -> str:
+    return f"interquartile mean of {number} seeds, {seed_interval_name(number)}"

@@ -1,4 +1,4 @@
-"""What can be said of a run folder without running anything."""
+"""Describes a run folder without running anything."""
 
 from __future__ import annotations
 
@@ -9,30 +9,28 @@ from jaxpg.program import agents
 from jaxpg.program.backend import prepare
 from jaxpg.program.schedule import Schedule, plan
 from jaxpg.run.loop import is_solved
-from jaxpg.run.terminal import shown
+from jaxpg.run.terminal import format_metric
 from jaxpg.store import config_file, folder, lock, same_run, versions
 from jaxpg.store.checkpoint import CheckpointError, Checkpoints
-from jaxpg.store.folder import RunFolder, jsonable
-from jaxpg.store.lines import up_to
-from jaxpg.store.results import best_returns, table
+from jaxpg.store.folder import RunFolder, to_json
+from jaxpg.store.lines import select_until
+from jaxpg.store.results import best_returns, make_table
 
 
 class Inspection(NamedTuple):
-    """A run as its folder shows it.
+    """The state of a run, from its folder.
 
     Attributes:
-      run_folder, config: of the run.
-      checkpoints: the problem of each checkpoint by its number, None where it is sound and of this run; the newest
-        first.
-      update: of the newest sound checkpoint; 0 where there is none.
-      schedule: of the run.
+      run_folder, config, schedule: folder, configuration and schedule of the run.
+      checkpoints: number -> problem of the checkpoint, None if it is sound and belongs to this run; newest first.
+      update: update of the newest sound checkpoint; 0 if there is none.
       finished: whether nothing is left to do.
-      owner: the process that is training in it just now, such as "process 12 on atlas"; None where there is none.
-      digest: of the state in the newest sound checkpoint; two runs are at the same point, bit for bit, where it is the
-        same. None where there is none.
-      lines: of metrics.
-      changed: name -> (what it was when the run last went on, what it is now), of versions and machine.
-      earlier: versions and machines that have computed parts of the run before those.
+      owner: the process that is training in it now, such as "process 12 on atlas", or None.
+      digest: digest of the state in the newest sound checkpoint, or None; equal if two runs are bit for bit at the same
+        point.
+      lines: lines of metrics.
+      changed: name -> (value when the run last continued, value now), for versions and machine.
+      earlier: number of other versions and machines that computed earlier parts of the run.
     """
 
     run_folder: RunFolder
@@ -49,22 +47,22 @@ class Inspection(NamedTuple):
 
 
 def inspect(path: str) -> Inspection:
-    """Looks at the run in the folder `path`.
+    """Inspects the run in the folder `path`.
 
     Raises:
-      UserError: it is no run folder, or its configuration or versions cannot be read.
+      UserError: it is not a run folder, or its configuration or versions cannot be read.
     """
     run_folder = folder.find(path)
     config = config_file.load(run_folder.config)
     lines = folder.read_metrics(run_folder, config.num_agents)
-    prepare(config)  # as for a training, whose versions are compared
+    prepare(config)  # as in training, to compare versions
     stored = Checkpoints(run_folder.checkpoints, read_only=True)
-    checkpoints = {number: _problem(stored, number, config) for number in stored.numbers()}
+    checkpoints = {number: _find_problem(stored, number, config) for number in stored.numbers()}
     sound = [number for number, problem in checkpoints.items() if problem is None]
     update = sound[0] if sound else 0
     schedule = plan(config)
-    best_of_checkpoint = best_returns(up_to(lines, update))
-    before = folder.read_versions(run_folder)
+    best_of_checkpoint = best_returns(select_until(lines, update))
+    recorded = folder.read_versions(run_folder)
     return Inspection(
         run_folder=run_folder,
         config=config,
@@ -72,15 +70,15 @@ def inspect(path: str) -> Inspection:
         update=update,
         schedule=schedule,
         finished=bool(sound) and (update >= schedule.num_updates or is_solved(config.run, best_of_checkpoint)),
-        owner=lock.owner(run_folder.path),
+        owner=lock.find_owner(run_folder.path),
         digest=stored.digest(update) if sound else None,
         lines=lines,
-        changed=versions.changes(before, versions.versions()),
-        earlier=len(before.get("earlier", [])),
+        changed=versions.find_changes(recorded, versions.collect_versions()),
+        earlier=len(recorded.get("earlier", [])),
     )
 
 
-def _problem(checkpoints: Checkpoints, number: int, config: Config) -> CheckpointError | None:
+def _find_problem(checkpoints: Checkpoints, number: int, config: Config) -> CheckpointError | None:
     try:
         checkpoints.read(number)
         same_run.check_checkpoint(checkpoints, number, config)
@@ -89,48 +87,55 @@ def _problem(checkpoints: Checkpoints, number: int, config: Config) -> Checkpoin
     return None
 
 
-def summary(found: Inspection) -> dict[str, Any]:
+def summarize(inspection: Inspection) -> dict[str, Any]:
     """The inspection as plain values: `step` counts updates, as checkpoints do, and `steps` environment steps."""
     return {
-        "step": found.update,
-        "steps": found.update * found.schedule.steps_per_update,
-        "finished": found.finished,
-        "owner": found.owner,
-        "digest": found.digest,
-        "checkpoints": [{"step": number, "sound": problem is None} for number, problem in found.checkpoints.items()],
+        "step": inspection.update,
+        "steps": inspection.update * inspection.schedule.steps_per_update,
+        "finished": inspection.finished,
+        "owner": inspection.owner,
+        "digest": inspection.digest,
+        "checkpoints": [
+            {"step": number, "sound": problem is None} for number, problem in inspection.checkpoints.items()
+        ],
     }
 
 
-def described(found: Inspection) -> str:
-    """The inspection in words, a line for each thing."""
-    done, total = found.update * found.schedule.steps_per_update, found.schedule.total_steps
-    checkpoints = [f"{number} {problem.word if problem else 'sound'}" for number, problem in found.checkpoints.items()]
+def describe(inspection: Inspection) -> str:
+    """The inspection as text, one line per item."""
+    done, total = inspection.update * inspection.schedule.steps_per_update, inspection.schedule.total_steps
+    checkpoints = [
+        f"{number} {problem.word if problem else 'sound'}" for number, problem in inspection.checkpoints.items()
+    ]
     rows = {
-        "run": agents.described(found.config),
-        "progress": f"{done:,} of {total:,} steps, " + ("finished" if found.finished else "not finished"),
+        "run": agents.described(inspection.config),
+        "progress": f"{done:,} of {total:,} steps, " + ("finished" if inspection.finished else "not finished"),
         "checkpoints": ", ".join(checkpoints) or "none",
     }
-    if found.owner:
-        rows["training"] = f"just now, by {found.owner}"
-    rows |= _returns(found) | {"versions": _versions(found), "digest": found.digest or "none"}
-    problems = [f"{problem.word}: {problem}" for problem in found.checkpoints.values() if problem]
+    if inspection.owner:
+        rows["training"] = f"now, by {inspection.owner}"
+    rows |= _describe_returns(inspection) | {
+        "versions": _describe_versions(inspection),
+        "digest": inspection.digest or "none",
+    }
+    problems = [f"{problem.word}: {problem}" for problem in inspection.checkpoints.values() if problem]
     return "\n".join([f"{name:<12} {value}" for name, value in rows.items()] + problems)
 
 
-def _returns(found: Inspection) -> dict[str, str]:
-    """What the evaluations say; nothing before the first."""
-    evaluations = [line["eval_return"] for line in found.lines if "eval_return" in line]
+def _describe_returns(inspection: Inspection) -> dict[str, str]:
+    """Returns of the evaluations; empty before the first."""
+    evaluations = [line["eval_return"] for line in inspection.lines if "eval_return" in line]
     if not evaluations:
         return {}
-    best = jsonable(best_returns(found.lines))
-    rows = {"return": f"{shown(evaluations[-1])} at the last evaluation, {shown(best)} at best"}
-    if found.config.sweep:
-        setting, score = next(iter(table(found.config, found.lines).items()))
+    best = to_json(best_returns(inspection.lines))
+    rows = {"return": f"{format_metric(evaluations[-1])} at the last evaluation, {format_metric(best)} at best"}
+    if inspection.config.sweep:
+        setting, score = next(iter(make_table(inspection.config, inspection.lines).items()))
         rows["best setting"] = f"{setting}: {score}"
     return rows
 
 
-def _versions(found: Inspection) -> str:
-    changes = ", ".join(f"{name} was {was} and is {now}" for name, (was, now) in found.changed.items())
-    earlier = f"; {found.earlier} others before (versions.json)" if found.earlier else ""
-    return (changes or "as they are now") + earlier
+def _describe_versions(inspection: Inspection) -> str:
+    changes = ", ".join(f"{name} was {old} and is {new}" for name, (old, new) in inspection.changed.items())
+    earlier = f"; {inspection.earlier} others before (versions.json)" if inspection.earlier else ""
+    return (changes or "unchanged") + earlier

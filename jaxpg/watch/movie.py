@@ -1,7 +1,7 @@
-"""Pictures one after another as a file: MP4 (H.264) by PyAV, GIF by Pillow.
+"""Writes images as a video: MP4 (H.264) with PyAV, GIF with Pillow.
 
-Both show the time as it is: MP4 at any rate of pictures; GIF, whose clock ticks in 1/100 s, with delays that differ by
-a tick where they have to, so that no error adds up.
+Both keep exact time: MP4 at any frame rate; GIF, whose clock ticks every 1/100 s, with delays that differ by a tick, so
+that no error accumulates.
 """
 
 from __future__ import annotations
@@ -23,17 +23,17 @@ from jaxpg.errors import UserError
 from jaxpg.store.folder import replace
 
 TICK = Fraction(1, 100)  # of a GIF's clock [s]
-SHORTEST = 2  # ticks of a picture: what says 1 is shown slowly by browsers
+MIN_TICKS = 2  # per picture: browsers slow down a GIF with 1
 QUALITY = "18"  # H.264's constant rate factor: 0 loses nothing, 51 is the worst
 
 
 class Format(NamedTuple):
-    """A way to keep pictures.
+    """A video format.
 
     Attributes:
-      write: `write(path, images, seconds)`, images `[H, W, 3]` with H and W even, each shown for so long.
-      fastest: the most pictures a second.
-      package: that it needs and that is not installed with this library; None: nothing.
+      write: `write(path, images, seconds)`: images `[H, W, 3]`, H and W even, each shown for `seconds`.
+      fastest: the highest frame rate, in images per second.
+      package: the package it needs, or None.
     """
 
     write: Callable[[Path, Iterable[np.ndarray], Fraction], None]
@@ -41,17 +41,17 @@ class Format(NamedTuple):
     package: str | None
 
 
-def chosen(out: Path) -> Format:
-    """The format that the name of a file ends in.
+def find_format(out: Path) -> Format:
+    """The format for a file's ending.
 
     Raises:
-      UserError: another ending, a folder of that name, or the format's package is not installed.
+      UserError: the ending is unknown, a folder has that name, or the format's package is not installed.
     """
     form = FORMATS.get(out.suffix.lower())
     if form is None:
         raise UserError(f"out={out}: must end in {' or '.join(FORMATS)}")
     if out.is_dir():
-        raise UserError(f"out={out}: there is a folder of that name")
+        raise UserError(f"out={out}: a folder has that name")
     if form.package and importlib.util.find_spec(form.package) is None:
         remedy = f"{pip_install(form.package)}; out=FILE.gif needs none"
         raise UserError(f"out={out}: {out.suffix} needs a package, {remedy}")
@@ -59,24 +59,24 @@ def chosen(out: Path) -> Format:
 
 
 def write(out: Path, images: Iterable[np.ndarray], seconds: Fraction) -> None:
-    """Writes a file in the format of its name; whoever looks sees it as it was or whole.
+    """Writes a video in the format of its ending, atomically.
 
     Args:
-      out: the file; folders above it are made.
-      images: `[H, W, 3]` each, H and W even.
+      out: the file; missing parent folders are created.
+      images: each `[H, W, 3]`, H and W even.
       seconds: how long each is shown.
 
     Raises:
-      UserError: as in `chosen`, or it cannot be written.
+      UserError: as in `find_format`, or the file cannot be written.
     """
-    form = chosen(out)
-    with _replacing(out) as unfinished:
+    form = find_format(out)
+    with _replace_file(out) as unfinished:
         form.write(unfinished, images, seconds)
 
 
 @contextlib.contextmanager
-def _replacing(path: Path) -> Iterator[Path]:
-    """A name elsewhere to write to; what is there in the end takes the file's place."""
+def _replace_file(path: Path) -> Iterator[Path]:
+    """Yields a temporary path; what is written there replaces the file after the block."""
     try:
         with tempfile.TemporaryDirectory() as place:
             unfinished = Path(place, "movie")
@@ -99,7 +99,7 @@ def _write_mp4(path: Path, images: Iterable[np.ndarray], seconds: Fraction) -> N
     with path.open("wb") as file, av.open(file, "w", format="mp4") as container:
         stream = container.add_stream("libx264", rate=1 / seconds, options={"crf": QUALITY})
         stream.height, stream.width = first.shape[:2]
-        stream.pix_fmt = "yuv420p"  # what every player knows; it has one colour for 2 x 2 pixels
+        stream.pix_fmt = "yuv420p"  # every player knows it; one colour for 2 x 2 pixels
         for image in itertools.chain([first], images):
             container.mux(stream.encode(av.VideoFrame.from_ndarray(np.ascontiguousarray(image), format="rgb24")))
         container.mux(stream.encode())
@@ -109,15 +109,15 @@ def _write_gif(path: Path, images: Iterable[np.ndarray], seconds: Fraction) -> N
     from PIL import Image
 
     pictures = [Image.fromarray(image).quantize(method=Image.Quantize.FASTOCTREE) for image in images]
-    milliseconds = [10 * delay for delay in delays(len(pictures), seconds)]
+    milliseconds = [10 * delay for delay in compute_delays(len(pictures), seconds)]
     first, *rest = pictures
     first.save(path, format="GIF", save_all=True, append_images=rest, duration=milliseconds, loop=0)
 
 
-def delays(number: int, seconds: Fraction) -> list[int]:
-    """How long each of the pictures is shown, in ticks: picture i begins at the tick next to i * seconds.
+def compute_delays(number: int, seconds: Fraction) -> list[int]:
+    """How long each picture is shown, in ticks: picture i begins at the tick nearest to i * seconds.
 
-    >>> delays(6, Fraction(1, 30))
+    >>> compute_delays(6, Fraction(1, 30))
     [3, 4, 3, 3, 4, 3]
     """
     begins = [math.floor(i * seconds / TICK + Fraction(1, 2)) for i in range(number + 1)]
@@ -126,5 +126,5 @@ def delays(number: int, seconds: Fraction) -> list[int]:
 
 FORMATS = {
     ".mp4": Format(_write_mp4, 240, "av"),
-    ".gif": Format(_write_gif, int(1 / (SHORTEST * TICK)), None),
+    ".gif": Format(_write_gif, int(1 / (MIN_TICKS * TICK)), None),
 }

@@ -1,4 +1,4 @@
-"""The page of a run or of a comparison: one HTML file that loads nothing."""
+"""The page of a run or of a comparison: one self-contained HTML file."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from string import Template
 from typing import Any
 
 PARTS = Path(__file__).with_name("page")
-SCRIPTS = (  # in the order in which they are read: one module
+SCRIPTS = (  # joined in this order into one module
     "dom",
     "theme",
     "numbers",
@@ -33,34 +33,34 @@ SCRIPTS = (  # in the order in which they are read: one module
 )
 
 
-def page(data: Mapping[str, Any]) -> str:
-    """One HTML file, with its styles, its scripts and the data in it.
+def make_page(data: Mapping[str, Any]) -> str:
+    """One HTML file that contains its styles, scripts and data.
 
-    Its Content-Security-Policy lets the browser run this style and this script, by their digests, and load nothing.
+    Its Content-Security-Policy allows this style and this script, by their digests, and nothing else.
 
     Args:
-      data: of a run (`jaxpg.watch.report`) or of a comparison (`jaxpg.watch.comparison`): plain values, finite or None.
+      data: data from `jaxpg.watch.run_page` or `jaxpg.watch.comparison`: plain values, finite or None.
 
     Raises:
-      ValueError: a number that is not finite.
-      TypeError: a value that JSON does not know.
+      ValueError: a number is not finite.
+      TypeError: a value has no JSON form.
     """
-    style, script = _part("page.css"), "\n".join(_part(f"{name}.js") for name in SCRIPTS)
-    return Template(_part("page.html")).substitute(
-        policy=_policy(style, script), title=_text(data["title"]), style=style, script=script, data=_embedded(data)
+    style, script = _read_part("page.css"), "\n".join(_read_part(f"{name}.js") for name in SCRIPTS)
+    return Template(_read_part("page.html")).substitute(
+        policy=_make_policy(style, script), title=_escape(data["title"]), style=style, script=script, data=_embed(data)
     )
 
 
-def _part(name: str) -> str:
+def _read_part(name: str) -> str:
     return (PARTS / name).read_text(encoding="utf-8")
 
 
-def _policy(style: str, script: str) -> str:
-    """Nothing is allowed but what is named; the digests are of the text between the tags."""
+def _make_policy(style: str, script: str) -> str:
+    """The Content-Security-Policy; digests are of the text between the tags."""
     rules = {
         "default-src": "'none'",
-        "style-src": _digest(style),
-        "script-src": _digest(script),
+        "style-src": _make_digest(style),
+        "script-src": _make_digest(script),
         "img-src": "data:",
         "base-uri": "'none'",
         "form-action": "'none'",
@@ -68,15 +68,15 @@ def _policy(style: str, script: str) -> str:
     return "; ".join(f"{name} {value}" for name, value in rules.items())
 
 
-def _digest(text: str) -> str:
+def _make_digest(text: str) -> str:
     return f"'sha256-{base64.b64encode(hashlib.sha256(text.encode()).digest()).decode()}'"
 
 
-def _text(text: str) -> str:
-    """As HTML, in ASCII: half characters, as names of files can have them, would not go into a file."""
+def _escape(text: str) -> str:
+    """The text as ASCII HTML: lone surrogates, which file names may contain, cannot be encoded."""
     return html.escape(text).encode("ascii", "xmlcharrefreplace").decode()
 
 
-def _embedded(data: Mapping[str, Any]) -> str:
-    """JSON that can stand inside of a script element: no `</script>` and no `<!--` in it."""
+def _embed(data: Mapping[str, Any]) -> str:
+    """JSON that is safe inside a script element: without `</script>` and `<!--`."""
     return json.dumps(data, allow_nan=False, separators=(",", ":")).replace("<", "\\u003c")

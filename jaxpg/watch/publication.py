@@ -1,4 +1,4 @@
-"""Methods side by side for a paper: their curves as a vector figure, their table as CSV."""
+"""Compares methods for a paper: curves as a vector figure, a table as CSV."""
 
 from __future__ import annotations
 
@@ -9,18 +9,18 @@ from typing import Any
 
 import numpy as np
 
-from jaxpg.store.statistics import has_interval, interquartile_mean, spread, spread_name
+from jaxpg.store.statistics import has_interval, interquartile_mean, seed_interval, seed_interval_name
 from jaxpg.watch.curves import PANELS
 from jaxpg.watch.figures import COLORS
-from jaxpg.watch.methods import Method, standings
+from jaxpg.watch.methods import Method, compute_standings
 
 WIDTH, HEIGHT = 3.4, 2.6  # of a panel [inch]: one column of a paper
-# A method is told by its dashes and marks as well, so that it can be read without colours.
+# Methods also differ in dashes and marks, so that the figure can be read without colours.
 DASHES = ("-", "--", "-.", ":")
 MARKS = ("o", "s", "^", "D", "v", "P", "X")
-MARKED = 8  # points of a curve with a mark
+NUM_MARKS = 8  # on a curve
 STYLE = {
-    "pdf.fonttype": 42,  # whole TrueType fonts, as publishers ask for
+    "pdf.fonttype": 42,  # TrueType fonts, as publishers require
     "svg.fonttype": "path",  # letters as outlines: the same everywhere
     "svg.hashsalt": "jaxpg",  # the same file from the same runs
     "font.size": 8,
@@ -29,30 +29,30 @@ STYLE = {
 NO_DATE = {"pdf": {"CreationDate": None}, "svg": {"Date": None}}
 
 
-def figure(found: Sequence[Method], form: str) -> bytes:
-    """The learning curves as a vector figure with its fonts in it, readable without colours.
+def draw_figure(methods: Sequence[Method], form: str) -> bytes:
+    """The learning curves as a vector figure with embedded fonts, readable without colours.
 
     Args:
-      found: the methods; several seeds are drawn as their interquartile mean and `spread`.
+      methods: the methods; several seeds are drawn as interquartile mean and `seed_interval`.
       form: "pdf" or "svg".
     """
     import matplotlib
     from matplotlib.figure import Figure
 
-    shown = [metric for metric in PANELS if any(method.values(metric)[0].size for method in found)]
+    metrics = [metric for metric in PANELS if any(method.values(metric)[0].size for method in methods)]
     buffer = io.BytesIO()
     with matplotlib.rc_context(STYLE):
-        drawn = Figure(figsize=(WIDTH * len(shown), HEIGHT), layout="constrained")
-        for axes, metric in zip(drawn.subplots(1, len(shown), squeeze=False)[0], shown, strict=True):
-            _draw(axes, found, metric)
-        drawn.savefig(buffer, format=form, metadata=NO_DATE[form])
+        figure = Figure(figsize=(WIDTH * len(metrics), HEIGHT), layout="constrained")
+        for axes, metric in zip(figure.subplots(1, len(metrics), squeeze=False)[0], metrics, strict=True):
+            _draw(axes, methods, metric)
+        figure.savefig(buffer, format=form, metadata=NO_DATE[form])
     return buffer.getvalue()
 
 
-def _draw(axes: Any, found: Sequence[Method], metric: str) -> None:
+def _draw(axes: Any, methods: Sequence[Method], metric: str) -> None:
     axes.set(xlabel="environment steps", ylabel=PANELS[metric])
     axes.grid(alpha=0.3, linewidth=0.5)
-    for i, method in enumerate(found):
+    for i, method in enumerate(methods):
         steps, values = method.values(metric)
         if steps.size:
             _draw_method(axes, i, method.label, steps, values)
@@ -66,33 +66,33 @@ def _draw_method(axes: Any, i: int, label: str, steps: np.ndarray, values: np.nd
         color=color,
         linestyle=DASHES[i % len(DASHES)],
         marker=MARKS[i % len(MARKS)],
-        markevery=max(1, size // MARKED),
+        markevery=max(1, size // NUM_MARKS),
         markersize=3,
         linewidth=1.2,
     )
-    line.set_label(f"{label}\n({number} seeds, {spread_name(number)})" if number > 1 else f"{label} (1 seed)")
+    line.set_label(f"{label}\n({number} seeds, {seed_interval_name(number)})" if number > 1 else f"{label} (1 seed)")
     if number > 1:
-        axes.fill_between(steps, *spread(values), color=color, alpha=0.15, linewidth=0)
+        axes.fill_between(steps, *seed_interval(values), color=color, alpha=0.15, linewidth=0)
 
 
-def csv_table(found: Sequence[Method]) -> str:
-    """A line for each method, the best first: interquartile means over its seeds, and their 95 % intervals.
+def format_csv(methods: Sequence[Method]) -> str:
+    """A line for each method, best first: interquartile means over its seeds, and their 95 % intervals.
 
-    The ends of an interval are empty where the seeds are too few for one; success where the environment does not say.
+    An interval is empty if there are too few seeds for one, and success if the environment does not report it.
     """
     names = [f"{metric}{end}" for metric in ("return", "success") for end in ("", "_low", "_high")]
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
     writer.writerow(["method", "seeds", "environment_steps", *names])
-    for one in standings(found):
-        numbers = [*_with_interval(one.returns), *_with_interval(one.success)]
+    for one in compute_standings(methods):
+        numbers = [*_list_interval(one.returns), *_list_interval(one.success)]
         writer.writerow([one.method.label, len(one.method.agents), one.steps, *numbers])
     return text.getvalue()
 
 
-def _with_interval(values: np.ndarray | None) -> list[float | str]:
+def _list_interval(values: np.ndarray | None) -> list[float | str]:
     """Interquartile mean, lower and upper end."""
     if values is None:
         return ["", "", ""]
-    ends = [float(end) for end in spread(values)] if has_interval(len(values)) else ["", ""]
+    ends = [float(end) for end in seed_interval(values)] if has_interval(len(values)) else ["", ""]
     return [float(interquartile_mean(values)), *ends]

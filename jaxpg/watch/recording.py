@@ -1,4 +1,4 @@
-"""Complete episodes step by step: what reports and videos are drawn from."""
+"""Records complete episodes step by step, for reports and videos."""
 
 from __future__ import annotations
 
@@ -10,21 +10,21 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxpg.deploy.controller import physical
+from jaxpg.deploy.controller import to_physical
 from jaxpg.evaluation import play
 from jaxpg.program.backend import RUN_ONCE
 from jaxpg.program.state import Policy
 from jaxpg.store.policies import StoredPolicy
 from jaxpg.types import Metrics
-from jaxpg.watch.seen import Seen, seen
+from jaxpg.watch.view import View, find_view
 
 
 class Look(NamedTuple):
-    """What is seen of states `[...]`; None where the environment has no such thing.
+    """How states `[...]` look; None for what the environment lacks.
 
     Attributes:
       qpos: joint positions, `[..., nq]`.
-      goal: where to get, `[..., 3]` [m].
+      goal: position of the goal, `[..., 3]` [m].
       plane: coordinates in the phase plane, `[..., 2]`.
     """
 
@@ -34,16 +34,16 @@ class Look(NamedTuple):
 
 
 class Recording(NamedTuple):
-    """N episodes of one policy, time first; after an episode's end nothing moves and nothing is earned.
+    """N episodes of one policy, time first; after the end of an episode states stay fixed and rewards are 0.
 
     Attributes:
       look: before each step and after the last one, `[T + 1, N, ...]`.
       command: in physical units, `[T, N, m]`.
       reward: `[T, N]`.
-      value: V(s_t), the critic's guess of the discounted rewards to come, `[T, N]`.
+      value: V(s_t), the sum of discounted rewards that the critic expects, `[T, N]`.
       length: steps until termination, divergence or the time limit, `[N]`.
-      metrics: the environment's, after each step the last that were finite, `[T, N]` by name.
-      diverged: whether the physics did, `[N]` of bool.
+      metrics: metrics of the environment, for each step the last finite ones, `[T, N]` by name.
+      diverged: whether the physics diverged, `[N]` of bool.
     """
 
     look: Look
@@ -62,39 +62,39 @@ class Recording(NamedTuple):
 
 
 def record(
-    stored: StoredPolicy, policies: Sequence[Policy], starts: jax.Array, view: Seen | None = None
+    stored: StoredPolicy, policies: Sequence[Policy], starts: jax.Array, view: View | None = None
 ) -> list[Recording]:
     """An episode of each policy from each start.
 
     Args:
-      stored: how policies act, and where.
-      policies: all of the same network.
-      starts: random keys that fix them, `[N]`.
-      view: what can be seen of the environment; None: it is looked for.
+      stored: has the environment and `act`.
+      policies: policies with the same network.
+      starts: random keys of the starts, `[N]`.
+      view: what can be drawn of the environment; None: find it.
     """
-    look = jax.vmap(looking(view or seen(stored.env)))
-    played = jax.jit(lambda policy: _played(stored, policy, starts, look)).lower(stored.policy).compile(RUN_ONCE)
-    return [jax.tree.map(np.asarray, played(policy)) for policy in policies]
+    look = jax.vmap(make_look(view or find_view(stored.env)))
+    play = jax.jit(lambda policy: _play(stored, policy, starts, look)).lower(stored.policy).compile(RUN_ONCE)
+    return [jax.tree.map(np.asarray, play(policy)) for policy in policies]
 
 
-def _played(stored: StoredPolicy, policy: Policy, starts: jax.Array, look: Callable[[Any], Look]) -> Recording:
+def _play(stored: StoredPolicy, policy: Policy, starts: jax.Array, look: Callable[[Any], Look]) -> Recording:
     env = stored.env
 
-    def shown(step):
+    def observe(step):
         value = stored.value(policy, step.before.obs)
-        return look(step.after), physical(stored.interface, step.action), step.reward, value, step.metrics
+        return look(step.after), to_physical(stored.interface, step.action), step.reward, value, step.metrics
 
     length = stored.config.env.episode_length
     episodes, (after, command, reward, value, metrics) = play(
-        env, functools.partial(stored.act, policy), starts, length, shown
+        env, functools.partial(stored.act, policy), starts, length, observe
     )
     first = look(jax.vmap(env.reset)(jax.random.clone(starts)))  # the same starts on purpose
     looks = jax.tree.map(lambda x, rest: jnp.concatenate([x[None], rest]), first, after)
     return Recording(looks, command, reward, value, episodes.length, metrics, episodes.diverged)
 
 
-def looking(view: Seen) -> Callable[[Any], Look]:
-    """`look(State) -> Look` of an environment's states."""
+def make_look(view: View) -> Callable[[Any], Look]:
+    """Returns `look(State) -> Look`."""
     scene, plane = view
 
     def look(state):
@@ -107,8 +107,8 @@ def looking(view: Seen) -> Callable[[Any], Look]:
     return look
 
 
-def value_map(stored: StoredPolicy, policies: Sequence[Policy], columns: int, rows: int) -> list[np.ndarray]:
-    """V over the phase plane of the environment, for each policy: `[rows, columns]`, row 0 at the lower end of y."""
+def compute_value_map(stored: StoredPolicy, policies: Sequence[Policy], columns: int, rows: int) -> list[np.ndarray]:
+    """V over the environment's phase plane, for each policy: `[rows, columns]`, row 0 at the lower end of y."""
     plane = stored.env.phase_plane
     x, y = (jnp.linspace(low, high, n) for (low, high), n in zip(plane.ranges, (columns, rows), strict=True))
     obs = jax.vmap(lambda b: jax.vmap(lambda a: plane.observe(a, b))(x))(y)

@@ -1,4 +1,4 @@
-"""The policy that a run began with, to be watched beside the trained one."""
+"""The policy that a run began with, for comparison with the trained one."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from jaxpg.program.state import current_policy, initial_run
 from jaxpg.store.policies import StoredPolicy
 
 
-def untrained(stored: StoredPolicy) -> StoredPolicy:
+def make_untrained(stored: StoredPolicy) -> StoredPolicy:
     """The same agent before its first update."""
 
     def initial(seed):

@@ -1,4 +1,4 @@
-"""Episodes of a run's policy, side by side in one video."""
+"""Renders episodes of a run's policy, side by side, as a video."""
 
 from __future__ import annotations
 
@@ -20,42 +20,42 @@ from jaxpg.store import folder, policies
 from jaxpg.store.cache import compilation_cache, physics_cache
 from jaxpg.store.policies import StoredPolicy
 from jaxpg.watch import gl, movie
-from jaxpg.watch.clips import Clip, clip, command_names, frames, limits_of
+from jaxpg.watch.clips import Clip, find_command_names, find_limits, frame_steps, make_clip
 from jaxpg.watch.recording import record
-from jaxpg.watch.seen import seen
-from jaxpg.watch.untrained import untrained
+from jaxpg.watch.untrained import make_untrained
+from jaxpg.watch.view import find_view
 
-LARGEST = 8192  # pixels of an image, either way
-FINEST = 10_000  # of the denominator of pictures a second
-ROUNDING = 1e-6  # 0.05 s are 20 steps a second, although the float is not quite 1/20
+MAX_PIXELS = 8192  # of an image's width and height
+MAX_DENOMINATOR = 10_000  # of the frame rate as a fraction
+ROUNDING = 1e-6  # 0.05 s are 20 steps a second, although the float is not exactly 1/20
 
 
 def render(options: RenderOptions, changes: Mapping[str, Any], say: Callable[[str], None]) -> None:
     """Writes the video of a stored policy.
 
     Args:
-      options: of the command.
-      changes: to options of the environment.
-      say: takes lines of what was written.
+      options: options of the command.
+      changes: changed options of the environment.
+      say: takes lines for the user.
 
     Raises:
-      UserError: no such run or policy; its environment has nothing to be seen; no OpenGL to draw with; a package is
-        missing; or the video cannot be written. Nothing is written then.
+      UserError: there is no such run or policy, the environment cannot be drawn, OpenGL or a package is missing, or the
+        video cannot be written. Nothing is written then.
     """
     out = Path(options.out or Path(options.run) / "video.mp4")
-    form = movie.chosen(out)
+    format_ = movie.find_format(out)
     folder.find(options.run)
     _check_size(options)
-    backend = gl.backend(os.environ, gl.works)
+    backend = gl.find_backend(os.environ, gl.is_working)
     with physics_cache(options.cache):
-        stored = _stored(options, changes)
+        stored = _load_policy(options, changes)
     with compilation_cache(options.cache, say):
-        clips = played(stored, options.episodes, options.seed)
-    every, seconds = pace(clips[0].dt, options.speed, min(options.fps, form.fastest))
-    movie.write(out, images(stored, clips, every, (options.width, options.height), backend), seconds)
-    number = len(shown(clips, every))
+        clips = play_clips(stored, options.episodes, options.seed)
+    interval, seconds = choose_pace(clips[0].dt, options.speed, min(options.fps, format_.fastest))
+    movie.write(out, draw_images(stored, clips, interval, (options.width, options.height), backend), seconds)
+    number = len(shown_steps(clips, interval))
     returns = " ".join(f"{one.episode_return:.1f}" for one in clips)
-    say(f"{described(stored.config)}, {stored.described(options.checkpoint)}")
+    say(f"{described(stored.config)}, {stored.describe(options.checkpoint)}")
     say(f"returns  {returns}")
     say(f"{out}  {number} pictures, {float(number * seconds):.2f} s at {float(1 / seconds):.4g} a second")
 
@@ -64,95 +64,95 @@ def _check_size(options: RenderOptions) -> None:
     for name in ("width", "height"):
         if getattr(options, name) % 2:
             raise UserError(f"{name}={getattr(options, name)}: must be even, as H.264 has pixels in pairs")
-    rows, columns = grid(options.episodes)
+    rows, columns = choose_grid(options.episodes)
     width, height = columns * options.width, rows * options.height
-    if max(width, height) > LARGEST:
+    if max(width, height) > MAX_PIXELS:
         raise UserError(
             f"{options.episodes} episodes of {options.width} x {options.height} are {width} x {height} pixels, "
-            f"more than {LARGEST}: make width and height smaller, or episodes fewer"
+            f"more than {MAX_PIXELS}: make width and height smaller, or episodes fewer"
         )
 
 
-def grid(number: int) -> tuple[int, int]:
-    """Rows and columns of the squarest grid with so many places, no more rows than columns.
+def choose_grid(number: int) -> tuple[int, int]:
+    """Rows and columns of the squarest grid for `number` pictures, with no more rows than columns.
 
-    >>> [grid(n) for n in (1, 2, 3, 4, 5, 12)]
+    >>> [choose_grid(n) for n in (1, 2, 3, 4, 5, 12)]
     [(1, 1), (1, 2), (2, 2), (2, 2), (2, 3), (3, 4)]
     """
     columns = math.ceil(math.sqrt(number))
     return math.ceil(number / columns), columns
 
 
-def _stored(options: RenderOptions, changes: Mapping[str, Any]) -> StoredPolicy:
-    saved = "best" if options.checkpoint == "untrained" else options.checkpoint
-    stored = policies.load(options.run, saved, options.agent, changes)
+def _load_policy(options: RenderOptions, changes: Mapping[str, Any]) -> StoredPolicy:
+    checkpoint = "best" if options.checkpoint == "untrained" else options.checkpoint
+    stored = policies.load(options.run, checkpoint, options.agent, changes)
     notes: list[str] = []
-    if seen(stored.env, notes.append).scene is None:
-        why = f": {'; '.join(notes)}" if notes else " is no robot: there is nothing to be seen of it"
-        raise UserError(f"env={stored.config.choices['env']}{why}")
-    return untrained(stored) if options.checkpoint == "untrained" else stored
+    if find_view(stored.env, notes.append).scene is None:
+        reason = f": {'; '.join(notes)}" if notes else " has no robot that could be drawn"
+        raise UserError(f"env={stored.config.choices['env']}{reason}")
+    return make_untrained(stored) if options.checkpoint == "untrained" else stored
 
 
-def played(stored: StoredPolicy, number: int, seed: int) -> list[Clip]:
-    """Episodes from the starts of an evaluation with as many episodes and this seed, every step of each."""
+def play_clips(stored: StoredPolicy, number: int, seed: int) -> list[Clip]:
+    """Every step of episodes from the starts of an evaluation with this number of episodes and this seed."""
     (recording,) = record(stored, [stored.policy], jax.random.split(jax.random.key(seed), number))
-    return [clip(stored, recording, episode) for episode in range(number)]
+    return [make_clip(stored, recording, episode) for episode in range(number)]
 
 
-def pace(dt: float, speed: float, most: int) -> tuple[int, Fraction]:
-    """Every how many steps one is shown, and for how long [s].
+def choose_pace(dt: float, speed: float, most: int) -> tuple[int, Fraction]:
+    """Number of steps from one picture to the next, and how long a picture is shown [s].
 
     Args:
       dt: time of a step [s].
-      speed: of the video; 1 is real time.
-      most: pictures a second.
+      speed: speed of the video; 1 is real time.
+      most: highest number of pictures per second.
 
-    >>> pace(0.05, 1.0, 60), pace(0.005, 1.0, 60)
+    >>> choose_pace(0.05, 1.0, 60), choose_pace(0.005, 1.0, 60)
     ((1, Fraction(1, 20)), (4, Fraction(1, 50)))
     """
-    every = max(1, math.ceil(speed / (dt * most) - ROUNDING))
-    return every, 1 / Fraction(speed / (dt * every)).limit_denominator(FINEST)
+    interval = max(1, math.ceil(speed / (dt * most) - ROUNDING))
+    return interval, 1 / Fraction(speed / (dt * interval)).limit_denominator(MAX_DENOMINATOR)
 
 
-def shown(clips: Sequence[Clip], every: int) -> list[int]:
-    """The steps that are shown: up to the last one of the longest episode, that one included."""
-    return frames(max(len(one.look.qpos) for one in clips) - 1, every)
+def shown_steps(clips: Sequence[Clip], interval: int) -> list[int]:
+    """The steps that are shown, up to and including the last one of the longest episode."""
+    return frame_steps(max(len(one.look.qpos) for one in clips) - 1, interval)
 
 
-def images(
-    stored: StoredPolicy, clips: Sequence[Clip], every: int, size: tuple[int, int], backend: str
+def draw_images(
+    stored: StoredPolicy, clips: Sequence[Clip], interval: int, size: tuple[int, int], backend: str
 ) -> Iterator[np.ndarray]:
     """The images of the video, `[H, W, 3]`.
 
     Args:
       stored: the policy that plays.
-      clips: of episodes with every step.
-      every: how many steps one is shown.
+      clips: episodes with every step.
+      interval: number of steps from one picture to the next.
       size: width and height of one episode's picture.
-      backend: as `gl.backend` finds it.
+      backend: from `gl.find_backend`.
     """
     from jaxpg.watch.canvas import Canvas
 
-    view = seen(stored.env).scene
-    with Canvas(view.model, backend, grid(len(clips)), size, view.goal_radius) as canvas:
-        for step in shown(clips, every):
-            yield canvas.draw([cell(stored, view, one, step) for one in clips])
+    scene = find_view(stored.env).scene
+    with Canvas(scene.model, backend, choose_grid(len(clips)), size, scene.goal_radius) as canvas:
+        for step in shown_steps(clips, interval):
+            yield canvas.draw([make_cell(stored, scene, one, step) for one in clips])
 
 
-def cell(stored: StoredPolicy, view: Scene, one: Clip, step: int) -> Any:
-    """What is drawn of an episode at a step; after its end, what it ended with."""
+def make_cell(stored: StoredPolicy, scene: Scene, one: Clip, step: int) -> Any:
+    """The picture of an episode at a step; after its end, the last one."""
     from jaxpg.watch.canvas import Cell
 
-    last, names = len(one.look.qpos) - 1, command_names(stored)
-    now = min(step, last)
-    commands = np.array([one.series[name][now] if now < last else 0.0 for name in names])
-    efforts = commands / limits_of(stored) if len(names) == view.model.nu else np.zeros(view.model.nu)
-    goal = None if one.look.goal is None else one.look.goal[now]
-    return Cell(one.look.qpos[now], goal, efforts, _caption(one, now, last))
+    last, names = len(one.look.qpos) - 1, find_command_names(stored)
+    current = min(step, last)
+    commands = np.array([one.series[name][current] if current < last else 0.0 for name in names])
+    efforts = commands / find_limits(stored) if len(names) == scene.model.nu else np.zeros(scene.model.nu)
+    goal = None if one.look.goal is None else one.look.goal[current]
+    return Cell(one.look.qpos[current], goal, efforts, _make_caption(one, current, last))
 
 
-def _caption(one: Clip, now: int, last: int) -> str:
-    text = f"{now * one.dt:.2f} s  return {one.so_far[now]:.1f}"
-    if now == last and one.success is not None:
+def _make_caption(one: Clip, current: int, last: int) -> str:
+    text = f"{current * one.dt:.2f} s  return {one.so_far[current]:.1f}"
+    if current == last and one.success is not None:
         text += "  success" if one.success else "  missed"
     return text

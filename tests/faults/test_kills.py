@@ -64,7 +64,7 @@ def test_stopped_politely_several_times(undisturbed, command, command_environmen
             process.send_signal(signal.Signals[name])
             said = process.stdout.read()
             assert process.wait(timeout=60) == status, said
-        steps = re.search(rf"{name}: stopped at ([\d,]+) steps; resume={re.escape(str(folder))} goes on", said)[1]
+        steps = re.search(rf"{name}: stopped at ([\d,]+) steps; resume={re.escape(str(folder))} continues", said)[1]
         done.append(int(steps.replace(",", "")))
         assert outcome(folder)[0][-1]["steps"] == done[-1]
     assert done == sorted(done)

@@ -1,8 +1,8 @@
-"""Where metrics go besides `metrics.jsonl`: TensorBoard always, Weights & Biases and MLflow where they are asked for.
+"""Loggers besides `metrics.jsonl`: always TensorBoard, on request Weights & Biases and MLflow.
 
-Each is a `Logger`, one file for each library, and its failures never stop a run. TensorBoard's file is written by the
-training process itself. The others take seconds to import and wait for networks and databases, install hooks and talk
-to the terminal: each has a process of its own, which reads the lines from `metrics.jsonl` (follower.py, sender.py).
+Each is a `Logger`, with one file per library, and its failures never stop a run. TensorBoard's file is written by the
+training process itself. The others take seconds to import, wait for networks and databases, install hooks and write to
+the terminal. So each runs in its own process, which reads the lines from `metrics.jsonl` (follower.py, sender.py).
 """
 
 from __future__ import annotations
@@ -18,11 +18,11 @@ SERVICES = {
 
 
 class LoggerError(Exception):
-    """What has become of a logger; its text goes on after "note: NAME: "."""
+    """A failure of a logger; the text follows "note: NAME: "."""
 
 
 class Logger(Protocol):
-    """Begins when it is made; takes values, counted in environment steps; ends when it is closed."""
+    """Starts when it is created, takes values by environment steps, and ends when it is closed."""
 
     def write(self, values: Mapping[str, float], step: int) -> None: ...
 
@@ -30,44 +30,44 @@ class Logger(Protocol):
 
 
 class Service(Logger, Protocol):
-    """A logger that a module in `SERVICES` makes, as `begin(folder, name, config)`.
+    """A logger that a module in `SERVICES` creates with `begin(folder, name, config)`.
 
-    The module's `packages()` are those that it cannot do without.
+    The module's `packages()` are the packages that it requires.
 
     Attributes:
-      last: the last step that it has had from an earlier part of the run; -1 where there is none.
+      last: the last step logged by an earlier part of the run; -1 if there is none.
     """
 
     last: int
 
 
-class UntilItFails:
-    """A logger whose failures do not stop a run: there is one note, and nothing more is written to it.
+class SafeLogger:
+    """A logger whose failures do not stop a run: the first gives a note, and nothing more is logged.
 
     Args:
-      begin: makes the logger.
-      name: what the note calls it.
+      begin: creates the logger.
+      name: its name in the note.
       say: takes the note.
     """
 
     def __init__(self, begin: Callable[[], Logger], name: object, say: Callable[[str], None]):
         self._name, self._say = name, say
         self._logger: Logger | None = None
-        with self._noted():
+        with self._catch_failures():
             self._logger = begin()
 
     def write(self, values: Mapping[str, float], step: int) -> None:
         if self._logger is not None:
-            with self._noted():
+            with self._catch_failures():
                 self._logger.write(values, step)
 
     def close(self) -> None:
         if self._logger is not None:
-            with self._noted():
+            with self._catch_failures():
                 self._logger.close()
 
     @contextlib.contextmanager
-    def _noted(self) -> Iterator[None]:
+    def _catch_failures(self) -> Iterator[None]:
         try:
             yield
         except OSError as error:
@@ -80,8 +80,8 @@ class UntilItFails:
         self._say(f"note: {self._name}: {reason}")
 
 
-def values_of(line: Mapping[str, Any]) -> dict[str, float]:
-    """What loggers get of a line of metrics: means over the agents that have a number; without it, no value."""
+def mean_values(line: Mapping[str, Any]) -> dict[str, float]:
+    """The values for loggers in a line of metrics: means over the agents that have a number."""
     means = {name: _mean(value) for name, value in line.items() if name not in ("update", "steps")}
     return {name: mean for name, mean in means.items() if mean is not None}
 

@@ -1,9 +1,9 @@
 """The process of a logger: `python -m jaxpg.store.loggers.sender NAME RUN`, started by a Follower.
 
-It reads the lines of metrics from their file, from the first one on, and sends those to the service that are newer than
-the last that it has had. So nothing is missing there after a kill, after a failure or where the service was not asked
-for from the beginning; and nothing is there twice, for a run that was resumed repeats its lines to the bit.
-(But for `seconds`, and on another machine or with other versions: of lines repeated there, the first stay.)
+It reads the lines of metrics from their file, from the first one on, and sends those that are newer than the last one
+that the service has. So nothing is missing after a kill, after a failure, or if the service was only added later.
+Nothing is there twice, as a resumed run repeats its lines to the bit. (Except for `seconds`, and on another machine or
+with other versions: the service keeps the first version of a repeated line.)
 """
 
 from __future__ import annotations
@@ -18,66 +18,66 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import BinaryIO
 
-from jaxpg.store.loggers import SERVICES, Service, values_of
+from jaxpg.store.loggers import SERVICES, Service, mean_values
 
-ERROR = "error: "  # begins the line that says why it failed
-LONGEST = 600  # seconds that it goes on after the training has ended
-NOT_SENT = ("program",)  # of config.yaml: a path on this machine is no option of the run
+ERROR = "error: "  # prefix of the line that says why it failed
+MAX_SECONDS = 600  # that it continues after the training has ended
+NOT_SENT = ("program",)  # of config.yaml: a path on this machine, not an option of the run
 
 
 def main(arguments: Sequence[str]) -> int:
     """Sends lines until standard input ends; returns the exit status."""
     name, run = arguments[0], Path(arguments[1])
-    folder, told = run / "loggers", _only_ours(0)
+    folder, signals = run / "loggers", _claim_descriptor(0)
     with (run / "metrics.jsonl").open("rb") as lines, (folder / f"{name}.log").open("ab") as lock:
         try:
-            fcntl.flock(lock, fcntl.LOCK_EX)  # the one of the training before it may still be sending
+            fcntl.flock(lock, fcntl.LOCK_EX)  # the process of an earlier part may still be sending
             service = importlib.import_module(SERVICES[name])
-            logger = service.begin(folder, run.resolve().name, _read(run / "config.yaml"))
-            follow(logger, lines, told)
+            logger = service.begin(folder, run.resolve().name, _read_config(run / "config.yaml"))
+            follow(logger, lines, signals)
             logger.close()
-        except Exception as error:  # of any kind: whatever it is, the training says it in one line
+        except Exception as error:  # whatever it is, the training process reports it in one line
             print(f"{ERROR}{_first_line(error)}", file=sys.stderr, flush=True)
             return 1
     return 0
 
 
-def follow(service: Service, lines: BinaryIO, told: int) -> None:
+def follow(service: Service, lines: BinaryIO, signals: int) -> None:
     """Writes the lines that are newer than the service's last.
 
     Args:
-      service: where they go.
-      lines: the file of metrics, which grows.
-      told: descriptor of a pipe; bytes come when there are new lines, and its end when there will be none.
+      service: the service.
+      lines: the growing file of metrics.
+      signals: descriptor of a pipe; bytes signal new lines, and its end that there will be no more.
     """
     more = True
     while more:
-        more = bool(os.read(told, 1 << 16))
+        more = bool(os.read(signals, 1 << 16))
         if not more:
-            signal.alarm(LONGEST)
-        for line in map(json.loads, _new(lines)):
+            signal.alarm(MAX_SECONDS)
+        for line in map(json.loads, _read_new_lines(lines)):
             if line["steps"] > service.last:
-                service.write(values_of(line), line["steps"])
+                service.write(mean_values(line), line["steps"])
 
 
-def _new(lines: BinaryIO) -> list[bytes]:
-    """The whole lines that have come; of a torn one the rest may come, or it will be written anew."""
+def _read_new_lines(lines: BinaryIO) -> list[bytes]:
+    """The complete new lines; an incomplete one may be finished or rewritten later."""
     position = lines.tell()
     whole = lines.read().rpartition(b"\n")[0]
     lines.seek(position + len(whole) + bool(whole))
     return whole.splitlines()
 
 
-def _only_ours(descriptor: int) -> int:
-    """A descriptor for the same file, which libraries and their processes do not know; they find the null device."""
-    ours = os.dup(descriptor)
+def _claim_descriptor(descriptor: int) -> int:
+    """Moves a file to a new descriptor, so that libraries and their processes find the null device in its place."""
+    copy = os.dup(descriptor)
     null = os.open(os.devnull, os.O_RDONLY)
     os.dup2(null, descriptor)
     os.close(null)
-    return ours
+    return copy
 
 
-def _read(config: Path) -> dict:
+def _read_config(config: Path) -> dict:
     from jaxpg.config import plain_yaml
 
     values = plain_yaml.load(config.read_text(encoding="utf-8"))

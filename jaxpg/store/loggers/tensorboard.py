@@ -18,22 +18,22 @@ FLUSH_INTERVAL = 10.0  # seconds; each flush waits for the disk
 class TensorBoard:
     """Scalars in an event file, written by the caller's own thread.
 
-    tensorboardX's SummaryWriter has a thread for it: where the disk is full that ends with a traceback, and then the
-    training waits for ever to hand its values over.
+    tensorboardX's SummaryWriter writes in a thread of its own: on a full disk that ends with a traceback, and then the
+    training would hang.
 
     Args:
-      folder: where the event file will be.
-      purge_step: what TensorBoard has from an earlier part of the run at this step or later, it forgets.
+      folder: folder of the event file.
+      purge_step: TensorBoard drops what earlier parts of the run logged at this step or later.
 
     Raises:
-      OSError: here and below, the file cannot be written.
+      OSError: here and in all methods, the file cannot be written.
     """
 
     def __init__(self, folder: Path, purge_step: int):
         from tensorboardX.proto.event_pb2 import Event, SessionLog
 
         self._file = _Records(folder)
-        with self._closed_at_a_failure():
+        with self._close_on_failure():
             self._file.write(Event(wall_time=time.time(), file_version="brain.Event:2").SerializeToString())
             start = SessionLog(status=SessionLog.START)
             self._file.write(Event(step=purge_step, wall_time=time.time(), session_log=start).SerializeToString())
@@ -42,20 +42,20 @@ class TensorBoard:
 
     def write(self, values: Mapping[str, float], step: int) -> None:
         """Adds values at a step, counted in environment steps."""
-        with self._closed_at_a_failure():
-            self._file.write(_event(values, step).SerializeToString())
+        with self._close_on_failure():
+            self._file.write(_make_event(values, step).SerializeToString())
             if time.monotonic() - self._flushed > FLUSH_INTERVAL:
                 self._file.flush()
                 self._flushed = time.monotonic()
 
     def close(self) -> None:
-        with self._closed_at_a_failure():
+        with self._close_on_failure():
             self._file.flush()
             self._file.close()
 
     @contextlib.contextmanager
-    def _closed_at_a_failure(self) -> Iterator[None]:
-        """Else Python tries to write the rest when it forgets the file, and from 3.13 on prints a traceback."""
+    def _close_on_failure(self) -> Iterator[None]:
+        """Otherwise Python would try to write the rest when it frees the file, and since 3.13 print a traceback."""
         try:
             yield
         except OSError:
@@ -65,12 +65,12 @@ class TensorBoard:
 
 
 class _Records:
-    """A new file of records, as tensorboardX's RecordWriter writes them; that one takes names for addresses."""
+    """A new file of records, as tensorboardX's RecordWriter writes them, which takes some file names for URLs."""
 
     def __init__(self, folder: Path):
-        with files.opened(folder, make=True) as place:
+        with files.open_folder(folder, make=True) as place:
             new = os.O_WRONLY | os.O_CREAT | os.O_EXCL
-            self._file = os.fdopen(files.open_in(place, _after_the_others(os.listdir(place)), new), "wb")
+            self._file = os.fdopen(files.open_at(place, _next_name(os.listdir(place)), new), "wb")
         self.flush, self.close = self._file.flush, self._file.close
 
     def write(self, content: bytes) -> None:
@@ -84,17 +84,17 @@ def _checksum(content: bytes) -> bytes:
     return struct.pack("<I", masked_crc32c(content))
 
 
-def _after_the_others(names: Sequence[str]) -> str:
-    """The next event file's name: TensorBoard reads them in the order of their names.
+def _next_name(names: Sequence[str]) -> str:
+    """The name of the next event file; TensorBoard reads them in the order of their names.
 
-    By tensorboardX's own names, which begin with the time of day, a part of the run would come before an earlier one
-    if the clock was set back between them, and then be forgotten.
+    tensorboardX's own names begin with the time: if the clock was set back, a later part of the run would come before
+    an earlier one, and be dropped.
     """
     numbers = [int(found[1]) for name in names if (found := re.match(r"events_(\d{6})\.", name))]
     return f"events_{max(numbers, default=0) + 1:06d}.out.tfevents"
 
 
-def _event(values: Mapping[str, float], step: int):
+def _make_event(values: Mapping[str, float], step: int):
     from tensorboardX.proto.event_pb2 import Event
     from tensorboardX.proto.summary_pb2 import Summary
 

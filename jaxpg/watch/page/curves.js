@@ -31,7 +31,7 @@ function referencesInWords(panel) {
   const outside = (panel.references ?? []).filter(({ value }) => value < low || value > high);
   if (!outside.length) return null;
   const words = outside.map(({ label, value }) => `${label} ${text(value)}`).join(", ");
-  return element("p", { class: "reading" }, `outside of the picture: ${words}`);
+  return element("p", { class: "reading" }, `outside the picture: ${words}`);
 }
 
 function legendItem({ label, band }, numberOf) {

@@ -36,8 +36,8 @@ function scrolled(title, content) {
 }
 
 const IMPROVEMENT =
-  "How likely the run of the row does better than the run of the column, seed against seed, and the interval of " +
-  "that; in bold where the interval leaves out one half. Without an interval the seeds are too few for one.";
+  "The probability that a run of the row does better than a run of the column, with its interval; bold if the " +
+  "interval excludes one half. There is no interval if there are too few seeds.";
 
 /** P(row > column) of all pairs. */
 function improvement({ labels, probability, low, high }) {

@@ -1,4 +1,4 @@
-"""A trained policy for programs of one's own."""
+"""A trained policy for your own Python program."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import jax
 import numpy as np
 
 from envs.base import Interface
-from jaxpg.deploy.controller import command_fn
+from jaxpg.deploy.controller import make_command_fn
 from jaxpg.errors import UserError
 from jaxpg.program.state import Policy as Parameters
 from jaxpg.store import policies
@@ -24,16 +24,16 @@ CHECKPOINTS = ("best", "last")
 class Policy:
     """A deterministic policy, its value function and their parameters.
 
-    The methods take numpy and give numpy, for one observation `[n]` or several `[..., n]`, in float32. The functions
-    are compiled and pure, for what is jitted, differentiated or mapped around them.
+    The methods take and return numpy arrays, for one observation `[n]` or several `[..., n]`, in float32. The functions
+    are pure and compiled, so they can be used under `jit`, `grad` and `vmap`.
 
     Attributes:
       interface: names, units and limits of observations and commands.
       observation_size, action_size: n and m.
-      params: what was learned, an argument of the functions.
+      params: the learned parameters, an argument of the functions.
       command_fn: `command_fn(params, obs)`, `[..., n]` to `[..., m]`: limit * clip(action, -1, 1) in physical units, as
-        exported controllers have it; 0 where an observation is not valid (docs/deploy.md).
-      action_fn: `action_fn(params, obs)`, `[..., m]`: what the environment's `step` takes.
+        in exported controllers; 0 where an observation is not valid (docs/deploy.md).
+      action_fn: `action_fn(params, obs)`, `[..., m]`: the action for the environment's `step`.
       value_fn: `value_fn(params, obs)`, `[...]`: the sum of discounted rewards that the critic expects.
     """
 
@@ -46,7 +46,7 @@ class Policy:
     value_fn: Callable[[Parameters, Any], jax.Array]
 
     def __call__(self, obs: Any) -> np.ndarray:
-        """The command, in physical units; raises ValueError for another shape than `[..., n]`, as all methods do."""
+        """The command, in physical units; like all methods, raises ValueError unless the shape is `[..., n]`."""
         return np.asarray(self.command_fn(self.params, self._observation(obs)))
 
     def action(self, obs: Any) -> np.ndarray:
@@ -54,13 +54,13 @@ class Policy:
         return np.asarray(self.action_fn(self.params, self._observation(obs)))
 
     def value(self, obs: Any) -> np.ndarray:
-        """V(s), what is expected of the discounted rewards to come."""
+        """V(s), the expected sum of discounted rewards."""
         return np.asarray(self.value_fn(self.params, self._observation(obs)))
 
     def _observation(self, obs: Any) -> np.ndarray:
         obs, size = np.asarray(obs, np.float32), self.observation_size
         if obs.ndim == 0 or obs.shape[-1] != size:
-            raise ValueError(f"an observation is [{size}], several are [..., {size}]; this one is {list(obs.shape)}")
+            raise ValueError(f"expected an observation of shape [{size}] or [..., {size}], not {list(obs.shape)}")
         return obs
 
 
@@ -75,7 +75,7 @@ def load(run: str | Path, checkpoint: str = "best", agent: int | None = None) ->
         observation_size=stored.env.observation_size,
         action_size=stored.env.action_size,
         params=stored.policy,
-        command_fn=jax.jit(command_fn(stored)),
+        command_fn=jax.jit(make_command_fn(stored)),
         action_fn=jax.jit(stored.act),
         value_fn=jax.jit(stored.value),
     )

@@ -1,4 +1,4 @@
-"""The same steps learned from by JAX and by what was written, to be compared."""
+"""Replays the same steps through JAX and through an exported learner, to compare them."""
 
 from __future__ import annotations
 
@@ -23,10 +23,10 @@ from jaxpg.vector_env import vectorize
 NUM_STEPS = 1000
 
 
-def steps(stored: StoredPolicy) -> Transition:
-    """Steps of one environment under the policy with its noise, `[T, 1, ...]`, T <= `NUM_STEPS`.
+def collect_steps(stored: StoredPolicy) -> Transition:
+    """Steps of one environment under the stochastic policy, `[T, 1, ...]`, T <= `NUM_STEPS`.
 
-    Episodes with a step that would not be learned from (`jaxpg.online.learnable`) are left out, up to that step.
+    If training would not learn from a step (`jaxpg.online.learnable`), its episode is left out up to that step.
     """
     networks = make_networks(stored.config, stored.env)
     vector = vectorize(stored.env, 1, stored.config.env.episode_length)
@@ -39,28 +39,28 @@ def steps(stored: StoredPolicy) -> Transition:
 
     transition = play(stored.policy)
     sound = learnable(transition, stored.policy.normalizer, stored.config.algo.normalize_observations)
-    counts = np.asarray(divergence.lasting(~sound, transition.ended))[:, 0]
-    return jax.tree.map(lambda x: x[counts], transition)
+    is_learned = np.asarray(divergence.lasting(~sound, transition.ended))[:, 0]
+    return jax.tree.map(lambda x: x[is_learned], transition)
 
 
-def rows(transition: Transition) -> np.ndarray:
-    """Steps as the written example reads them, `[T, 2 n + m + 3]`."""
+def to_rows(transition: Transition) -> np.ndarray:
+    """Steps as the exported example reads them, `[T, 2 n + m + 3]`."""
     one = jax.tree.map(lambda x: np.asarray(x)[:, 0], transition)
-    ends = one.reward, one.next_obs, one.terminated, one.truncated
-    return np.concatenate([x.reshape(len(one.obs), -1) for x in (one.obs, one.u, *ends)], axis=1)
+    rest = one.reward, one.next_obs, one.terminated, one.truncated
+    return np.concatenate([x.reshape(len(one.obs), -1) for x in (one.obs, one.u, *rest)], axis=1)
 
 
-def learned(
+def learn(
     networks: Networks, options: Online, policy: Policy, log_std: np.ndarray, transition: Transition
 ) -> jax.Array:
     """W, b, log sigma, w and c after each of the steps, `[T, P]`, by `jaxpg.online.trace_update`.
 
     Args:
-      networks: linear.
-      options: of the algorithm.
-      policy: before the first step; its observation statistics stay as they are.
-      log_std: log sigma `[m]`, where it is none of the parameters.
-      transition: of one environment, `[T, 1, ...]`.
+      networks: linear networks.
+      options: options of the algorithm.
+      policy: the policy before the first step; its observation statistics stay fixed.
+      log_std: log sigma `[m]`, used if it is not a parameter.
+      transition: steps of one environment, `[T, 1, ...]`.
     """
     names = ("gamma", "lambda_actor", "lambda_critic", "actor_lr", "critic_lr", "reward_scale", "discounted")
     update = trace_update(networks, **{name: getattr(options, name) for name in names})
@@ -75,40 +75,42 @@ def learned(
         params, traces, _ = update(*carry, policy.normalizer, transition)
         return (params, traces), flat(params)
 
-    def learn(params, transition):
+    def replay(params, transition):
         zeros = jax.tree.map(lambda x: jnp.zeros((1, *x.shape), x.dtype), params)
         traces = Traces(zeros["actor"], zeros["critic"], jnp.ones_like(transition.reward[0]))
         return jax.lax.scan(step, (params, traces), transition)[1]
 
-    return jax.jit(learn)(policy.params, transition)
+    return jax.jit(replay)(policy.params, transition)
 
 
-def differences(found: np.ndarray, expected: np.ndarray) -> np.ndarray:
-    """max |a - b| / max(1, |b|) over the parameters after each step, `[T, P]` to `[T]`; NaN if there is one.
+def compare(found: np.ndarray, expected: np.ndarray) -> np.ndarray:
+    """max |a - b| / max(1, |b|) over the parameters after each step, `[T, P]` to `[T]`; NaN if any is.
 
-    >>> differences(np.array([[1.5, 200.0]]), np.array([[1.0, 100.0]])).tolist()
+    >>> compare(np.array([[1.5, 200.0]]), np.array([[1.0, 100.0]])).tolist()
     [1.0]
     """
-    with np.errstate(all="ignore"):  # numbers that have run away
+    with np.errstate(all="ignore"):  # diverged numbers
         return np.max(np.abs(found - expected) / np.maximum(1, np.abs(expected)), axis=1)
 
 
-def rounding(learn: Callable[[Transition], jax.Array], transition: Transition, expected: np.ndarray) -> np.ndarray:
-    """What float arithmetic may have made of the parameters after each step, `[T]`, as `differences`.
+def rounding_effect(
+    learn: Callable[[Transition], jax.Array], transition: Transition, expected: np.ndarray
+) -> np.ndarray:
+    """The effect of float rounding on the parameters after each step, `[T]`, measured as in `compare`.
 
-    It is the largest so far of the differences that the same steps make with every number changed in the last digit of
-    a float32; infinite from the step on after which there is a number that is not finite.
+    The largest difference so far when every number of the steps changes by one float32 epsilon; infinite once a number
+    is not finite.
 
     Args:
       learn: `learn(transition) -> parameters`, `[T, P]`.
       transition: the steps.
-      expected: what is learned from them.
+      expected: the parameters learned from them.
     """
     epsilon = float(np.finfo(np.float32).eps)
 
-    def changed(factor):
+    def relearn(factor):
         numbers = {name: factor * getattr(transition, name) for name in ("obs", "u", "reward", "next_obs")}
         return np.asarray(learn(transition._replace(**numbers)))
 
-    apart = np.maximum(*(differences(changed(1 + sign * epsilon), expected) for sign in (-1, 1)))
-    return np.maximum.accumulate(np.where(np.isnan(apart), np.inf, apart))
+    largest = np.maximum(*(compare(relearn(1 + sign * epsilon), expected) for sign in (-1, 1)))
+    return np.maximum.accumulate(np.where(np.isnan(largest), np.inf, largest))

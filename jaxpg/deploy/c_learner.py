@@ -1,4 +1,4 @@
-"""A linear-Gaussian controller that goes on learning, in C: `jaxpg.online` with one environment, the robot itself."""
+"""A linear-Gaussian controller that continues to learn, in C: `jaxpg.online` with one environment, the robot itself."""
 
 from __future__ import annotations
 
@@ -7,15 +7,15 @@ import numpy as np
 from jaxpg.deploy.controller import Controller, Learner
 
 CODE = """
-/* Going on with learning. After every step, with the features x of an observation s and x' of the next one,
+/* Learning. After every step, with the features x of an observation s and x' of the next one,
 
      delta   = {scale} reward + gamma V(s') - V(s),      V(s) = w'x + c,      gamma = 0 where the task has ended
      z_w     = gamma lambda_critic z_w + grad V(s)
      z_theta = gamma lambda_actor z_theta + {discounted} grad log N(u; W'x + b, sigma^2)
      w += alpha_critic delta z_w,    theta += alpha_actor delta z_theta
 
-   of the parameters theta = (W, b{sigma}). Nothing bounds a step: try new step sizes in a simulation first. But numbers
-   that are not finite are never learned from. */
+   with the parameters theta = (W, b{sigma}). Steps are not bounded: try new step sizes in simulation first. But
+   numbers that are not finite are never learned from. */
 #define POLICY_FEATURES {size}
 
 typedef struct {{
@@ -28,7 +28,7 @@ typedef struct {{
     policy_real factor; /* gamma^t where the gradient is discounted, else 1 */
 }} policy_learner;
 
-/* No traces, as before the first step of an episode. */
+/* Clears the traces, as before the first step of an episode. */
 static inline void policy_forget(policy_learner *learner) {{
     policy_parameters *z = &learner->traces;
     for (int i = 0; i < POLICY_FEATURES * POLICY_COMMANDS; i++) z->weight[i] = 0;
@@ -38,7 +38,7 @@ static inline void policy_forget(policy_learner *learner) {{
     learner->factor = 1;
 }}
 
-/* A learner with the parameters that were trained. */
+/* A learner with the trained parameters. */
 static inline void policy_begin(policy_learner *learner) {{
     policy_parameters *p = &learner->parameters;
     for (int i = 0; i < POLICY_FEATURES * POLICY_COMMANDS; i++) p->weight[i] = policy_weight_0[i];
@@ -49,8 +49,8 @@ static inline void policy_begin(policy_learner *learner) {{
     policy_forget(learner);
 }}
 
-/* Draws u = mean + sigma noise, of independent standard normal numbers of the caller's, and the command made of it.
-   Returns what policy_command does. */
+/* Computes u = mean + sigma noise from the caller's independent standard normal numbers, and the command for u.
+   Returns as policy_command does. */
 static inline int policy_sample(const policy_learner *learner, const policy_real observation[POLICY_OBSERVATIONS],
                                 const policy_real noise[POLICY_COMMANDS], policy_real u[POLICY_COMMANDS],
                                 policy_real command[POLICY_COMMANDS]) {{
@@ -68,10 +68,10 @@ static inline policy_real policy_value(const policy_learner *learner, const poli
     return value;
 }}
 
-/* Learns from one step. `terminated`: the task has ended, and nothing more will be earned; `truncated`: the episode is
-   cut, by a time limit say, and the next step begins another one. `next_observation` is the last one of the episode in
-   either case. Returns 1; or 0, having learned nothing and forgotten the traces, if u or the TD error is not finite, or
-   an observation is not valid (the next one does not matter where the task has ended). */
+/* Learns from one step. `terminated`: the task has ended, and no more reward follows; `truncated`: the episode was
+   cut, for example by a time limit, and the next step begins another one. In either case `next_observation` is the last
+   one of the episode. Returns 1; or 0, with the traces cleared and nothing learned, if u or the TD error is not finite
+   or an observation is not valid (after termination the next one does not matter). */
 static inline int policy_update(policy_learner *learner, const policy_real observation[POLICY_OBSERVATIONS],
                                 const policy_real u[POLICY_COMMANDS], policy_real reward,
                                 const policy_real next_observation[POLICY_OBSERVATIONS], int terminated,
@@ -121,8 +121,8 @@ LEARN_SIGMA = """
         p->log_sigma[j] += step_actor * z->log_sigma[j];"""
 
 EXAMPLE = """\
-/* Replays steps from standard input, for each: observation, u, reward, next observation, terminated, truncated.
-   Writes a line with all parameters after every step: W, b, log sigma, w, c. */
+/* Reads steps from standard input: observation, u, reward, next observation, terminated, truncated.
+   After each step, writes a line with all parameters: W, b, log sigma, w, c. */
 #include <stdio.h>
 
 #include "policy.h"
@@ -160,7 +160,7 @@ int main(void) {
 """
 
 
-def code(controller: Controller) -> str:
+def make_code(controller: Controller) -> str:
     """The second part of the header, about a controller called `policy`."""
     options = controller.learner.options
     return CODE.format(
@@ -173,8 +173,8 @@ def code(controller: Controller) -> str:
     )
 
 
-def arrays(learner: Learner) -> dict[str, np.ndarray]:
-    """The constants of the second part, by name: what was learned in float32, options in float64."""
+def make_arrays(learner: Learner) -> dict[str, np.ndarray]:
+    """The constants of the second part, by name: learned numbers in float32, options in float64."""
     options = learner.options
     numbers = (options.gamma, options.lambda_actor, options.lambda_critic, options.actor_lr, options.critic_lr)
     return {
