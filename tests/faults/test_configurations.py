@@ -19,7 +19,7 @@ from jaxpg import train
 from jaxpg.commands.ending import run_command
 from jaxpg.config.schema import GROUPS, Run
 from jaxpg.program import compile as program
-from jaxpg.store import cache
+from jaxpg.store import cache_folder
 
 BASE = {"env": "quadratic", "num_envs": 2, "total_steps": 32, "eval_episodes": 2, "env.episode_length": 4}
 BASE |= {"report": "false"}  # which takes longer than such a run
@@ -72,7 +72,7 @@ def command_lines(draw):
 @pytest.fixture(autouse=True)
 def quick_to_compile(monkeypatch, tmp_path):
     monkeypatch.setattr(program, "OPTIMIZED", program.RUN_ONCE)
-    monkeypatch.setattr(cache, "cache_folder", lambda: tmp_path / "cache" / "jaxpg")
+    monkeypatch.setattr(cache_folder, "locate", lambda: tmp_path / "cache" / "jaxpg")
 
 
 @rounds(FEW, MANY)
