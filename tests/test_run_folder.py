@@ -18,7 +18,8 @@ from processes import RUN, bound_by_permissions, outcome, proceed, stop_after, t
 from jaxpg import compare, evaluate, export, inspect, report, train
 from jaxpg.errors import UserError
 from jaxpg.store import cache_folder, files, folder, lines, lock, versions
-from jaxpg.store.checkpoint import CheckpointError, Checkpoints, SaveError
+from jaxpg.store.checkpoint import Checkpoints
+from jaxpg.store.checkpoint_errors import CheckpointError, SaveError
 from jaxpg.store.folder import RunFolder, read_metrics
 
 SIZES = ("env=quadratic", "network=linear", "num_envs=2", "num_steps=4", "log_interval=16", "eval_interval=32")

@@ -6,6 +6,7 @@ from collections.abc import Callable
 
 from jaxpg.config.configuration import Config
 from jaxpg.program.state import RunState
+from jaxpg.store.checkpoint_errors import SaveError
 from jaxpg.store.folder import RunFolder
 from jaxpg.store.metrics_log import MetricsLog
 
@@ -51,8 +52,6 @@ class Keeper:
 
     def _problem(self, update: int, state: RunState, log: MetricsLog) -> str | None:
         """Saves; what has kept it from that."""
-        from jaxpg.store.checkpoint import SaveError
-
         try:
             log.flush()  # first: a checkpoint whose lines are not there would be resumed with a gap
             if self._last != update:  # else only the best policy is missing
