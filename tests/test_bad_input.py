@@ -11,7 +11,7 @@ from processes import tree
 
 from jaxpg import evaluate, train
 from jaxpg.commands.ending import run_command
-from jaxpg.store import cache
+from jaxpg.store import cache_folder
 
 MISTAKES = {
     "unknown option": (["lerning_rate=3"], "unknown option 'lerning_rate'"),
@@ -164,7 +164,7 @@ def own_cache_folder(tmp_path_factory):
     """The commands run in this process: what they compile is not for the cache folder of who tests."""
     folder = tmp_path_factory.mktemp("cache") / "jaxpg"
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(cache, "cache_folder", lambda: folder)
+        patch.setattr(cache_folder, "locate", lambda: folder)
         yield
 
 

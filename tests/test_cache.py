@@ -9,9 +9,10 @@ import jax
 import jax.numpy as jnp
 import pytest
 
-from jaxpg.store import cache, stderr
-from jaxpg.store.cache import Store, cache_folder, compilation_cache, machine
+from jaxpg.store import cache_folder, executables, stderr
+from jaxpg.store.cache import compilation_cache
 from jaxpg.store.checkpoint import Checkpoints
+from jaxpg.store.executables import Executables, machine
 
 hits = []  # jax has no public way to take a listener back: one for all tests
 jax.monitoring.register_event_listener(
@@ -40,7 +41,7 @@ def compile_one(enabled=True, factor=3.0):
 
 
 def entries():
-    return sorted(path for path in (cache_folder() / machine()).iterdir() if path.name.startswith("jit__lambda"))
+    return sorted(path for path in (cache_folder.locate() / machine()).iterdir() if path.name.startswith("jit__lambda"))
 
 
 def test_the_second_time_nothing_is_compiled(folder):
@@ -126,7 +127,7 @@ def test_an_entry_that_jax_cannot_read_ends_the_cache_of_this_machine(folder):
     (entry,) = entries()
     entry.unlink()
     content = b"this is no program"
-    (entry.parent / f"{entry.name.rpartition('.')[0]}.{cache._digest(content)}").write_bytes(content)
+    (entry.parent / f"{entry.name.rpartition('.')[0]}.{cache_folder.digest(content)}").write_bytes(content)
     (line,) = compile_one()
     assert "no longer kept" in line
     assert entries() == []
@@ -179,7 +180,7 @@ def test_a_folder_that_others_can_write_to_is_refused(folder, which, mode):
 
 def test_a_folder_of_another_user_is_refused(folder, monkeypatch):
     compile_one()
-    monkeypatch.setattr(cache.os, "getuid", lambda: folder.stat().st_uid + 1)
+    monkeypatch.setattr(cache_folder.os, "getuid", lambda: folder.stat().st_uid + 1)
     (line,) = compile_one()
     assert "belongs to another user" in line
     assert hits == []
@@ -206,9 +207,9 @@ def test_which_folder(monkeypatch, tmp_path):
     monkeypatch.setenv("HOME", str(tmp_path))
     for value in ("", "relative/path"):
         monkeypatch.setenv("XDG_CACHE_HOME", value)
-        assert cache_folder() == tmp_path / ".cache" / "jaxpg"
+        assert cache_folder.locate() == tmp_path / ".cache" / "jaxpg"
     monkeypatch.setenv("XDG_CACHE_HOME", "/var/cache/me")
-    assert cache_folder() == Path("/var/cache/me/jaxpg")
+    assert cache_folder.locate() == Path("/var/cache/me/jaxpg")
 
 
 def test_every_machine_has_its_folder(monkeypatch):
@@ -217,9 +218,9 @@ def test_every_machine_has_its_folder(monkeypatch):
     names.add(machine())
     monkeypatch.setenv("PJRT_NPROC", "77")
     names.add(machine())
-    monkeypatch.setattr(cache, "cpu_features", lambda: b"flags: fpu")
+    monkeypatch.setattr(executables, "cpu_features", lambda: b"flags: fpu")
     names.add(machine())
-    monkeypatch.setattr(cache.jaxlib, "__version__", "9.9.9")
+    monkeypatch.setattr(executables.jaxlib, "__version__", "9.9.9")
     names.add(machine())
     assert len(names) == 5
     assert machine().startswith("jaxlib-9.9.9-")
@@ -236,29 +237,29 @@ def make_file(path, size, age):
 
 
 def test_old_entries_of_any_machine_are_removed(folder):
-    old = make_file(folder / "jaxlib-0.1" / "old", 1, cache.MAX_AGE + 60)
-    new = make_file(folder / "jaxlib-0.1" / "new", 1, cache.MAX_AGE - 60)
+    old = make_file(folder / "jaxlib-0.1" / "old", 1, cache_folder.MAX_AGE + 60)
+    new = make_file(folder / "jaxlib-0.1" / "new", 1, cache_folder.MAX_AGE - 60)
     compile_one()
     assert not old.exists()
     assert new.exists()
 
 
 def test_the_newest_entries_are_kept_up_to_a_size(folder, monkeypatch):
-    monkeypatch.setattr(cache, "MAX_BYTES", 100)
+    monkeypatch.setattr(cache_folder, "MAX_BYTES", 100)
     files = [make_file(folder / f"jaxlib-{i % 2}" / str(i), 30, age=60 * i) for i in range(5)]
-    cache.remove_old(folder)
+    cache_folder.remove_old(folder)
     assert [file.exists() for file in files] == [True, True, True, False, False]
 
 
 def test_entries_from_a_clock_that_was_wrong_leave_room_for_others(folder, monkeypatch):
     """They are not the newest until the clock has caught up with them, nor kept until then."""
-    monkeypatch.setattr(cache, "MAX_BYTES", 100)
+    monkeypatch.setattr(cache_folder, "MAX_BYTES", 100)
     ahead = [make_file(folder / "jaxlib-0" / f"ahead {days}", 40, age=-days * 24 * 3600) for days in (400, 20)]
     files = [make_file(folder / "jaxlib-0" / str(i), 40, age=60 * i) for i in range(2)]
-    cache.remove_old(folder)
+    cache_folder.remove_old(folder)
     assert [file.exists() for file in (*ahead, *files)] == [False, False, True, True]
     ahead = [make_file(folder / "jaxlib-0" / f"ahead {days}", 1, age=-days * 24 * 3600) for days in (400, 20)]
-    cache.remove_old(folder)
+    cache_folder.remove_old(folder)
     assert [file.exists() for file in (*ahead, *files)] == [False, True, True, True]
 
 
@@ -266,7 +267,7 @@ def test_a_clock_set_forward_takes_nothing_from_who_compiles(folder):
     """Another process may take its temporary folder for one that a killed process left; nobody notices."""
     said = []
     with compilation_cache(True, said.append):
-        cache.remove_old(folder, now=time.time() + 2 * cache.MAX_STAGING_AGE)
+        cache_folder.remove_old(folder, now=time.time() + 2 * cache_folder.MAX_STAGING_AGE)
         assert not list(folder.glob("staging-*"))
         jax.jit(lambda x: jnp.sin(x) * 7.0).lower(jnp.float32(0)).compile()
     assert said == []
@@ -275,9 +276,9 @@ def test_a_clock_set_forward_takes_nothing_from_who_compiles(folder):
 
 def test_what_a_killed_process_left_is_removed_after_a_day(folder):
     """That of a process that still compiles is left alone."""
-    with Store(folder).stage() as left, Store(folder).stage() as in_use:
-        os.utime(left, (time.time() - cache.MAX_STAGING_AGE - 60,) * 2)
-        cache.remove_old(folder)
+    with Executables(folder).stage() as left, Executables(folder).stage() as in_use:
+        os.utime(left, (time.time() - cache_folder.MAX_STAGING_AGE - 60,) * 2)
+        cache_folder.remove_old(folder)
         assert not Path(left).exists()
         assert Path(in_use).exists()
 

@@ -5,7 +5,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxpg.store.checkpoint import CheckpointError, Checkpoints
+from jaxpg.store.checkpoint import Checkpoints
+from jaxpg.store.checkpoint_errors import CheckpointError
 
 
 @pytest.mark.parametrize("impl", ["threefry2x32", "rbg"])

@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 from processes import LINES, RUN, bound_by_permissions, mounted, outcome, output_until, proceed, stop_after, training
 
-from jaxpg.store.checkpoint import Checkpoints, SaveError
+from jaxpg.store.checkpoint import Checkpoints
+from jaxpg.store.checkpoint_errors import SaveError
 from jaxpg.store.folder import RunFolder, read_metrics
 from jaxpg.store.metrics_log import MetricsLog
 

@@ -171,7 +171,7 @@ def test_a_missing_tool_is_one_line(monkeypatch, tmp_path):
 @cross
 @pytest.mark.study
 def test_the_experiment(monkeypatch):
-    written, full, obs = {}, microcontroller.train, microcontroller.observations
+    written, full, obs = {}, microcontroller.train, microcontroller.collect_observations
     sizes = (
         "num_envs=2",
         "eval_episodes=2",
@@ -181,7 +181,7 @@ def test_the_experiment(monkeypatch):
         "algo.critic_lr=1e-4",
     )
     monkeypatch.setattr(microcontroller, "train", lambda folder, *options: full(folder, *options, *sizes))
-    monkeypatch.setattr(microcontroller, "observations", lambda stored: obs(stored)[::500])
+    monkeypatch.setattr(microcontroller, "collect_observations", lambda stored: obs(stored)[::500])
     monkeypatch.setattr(microcontroller, "write_json", lambda name, content: written.update({name: content}))
     monkeypatch.setattr(microcontroller, "BUILDS", microcontroller.BUILDS[:1])
     assert microcontroller.main([]) == 0

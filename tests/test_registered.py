@@ -16,7 +16,7 @@ from jaxpg import train
 from jaxpg.commands.ending import run_command
 from jaxpg.config import configuration
 from jaxpg.config.parsing import compose
-from jaxpg.store import cache, config_file
+from jaxpg.store import cache_folder, config_file
 
 RUN = tuple(size for size in SIZES if not size.startswith("network"))
 
@@ -220,7 +220,7 @@ def test_without_training_values_the_defaults_apply_and_it_is_said(monkeypatch, 
 
 def test_trainings_in_threads(monkeypatch, tmp_path):
     """As Optuna's jobs and a graphical program have them: Python hears signals in the main thread only."""
-    monkeypatch.setattr(cache, "cache_folder", lambda: tmp_path / "cache" / "jaxpg")
+    monkeypatch.setattr(cache_folder, "locate", lambda: tmp_path / "cache" / "jaxpg")
     ended = {}
 
     def train_in(folder):

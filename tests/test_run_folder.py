@@ -17,8 +17,9 @@ from processes import RUN, bound_by_permissions, outcome, proceed, stop_after, t
 
 from jaxpg import compare, evaluate, export, inspect, report, train
 from jaxpg.errors import UserError
-from jaxpg.store import cache, files, folder, lines, lock, versions
-from jaxpg.store.checkpoint import CheckpointError, Checkpoints, SaveError
+from jaxpg.store import cache_folder, files, folder, lines, lock, versions
+from jaxpg.store.checkpoint import Checkpoints
+from jaxpg.store.checkpoint_errors import CheckpointError, SaveError
 from jaxpg.store.folder import RunFolder, read_metrics
 
 SIZES = ("env=quadratic", "network=linear", "num_envs=2", "num_steps=4", "log_interval=16", "eval_interval=32")
@@ -30,7 +31,7 @@ def own_cache_folder(tmp_path_factory):
     """The commands run in this process: what they compile is not for the cache folder of who tests."""
     place = tmp_path_factory.mktemp("cache") / "jaxpg"
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(cache, "cache_folder", lambda: place)
+        patch.setattr(cache_folder, "locate", lambda: place)
         patch.setattr(gc, "freeze", lambda: None)  # as of a process that ends
         yield
 

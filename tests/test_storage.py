@@ -13,8 +13,8 @@ import envs
 from envs.physics import step
 from envs.physics.interpreter import trace
 from envs.physics.storage import from_text, kept_in, name_of, to_text
-from jaxpg.store import cache
-from jaxpg.store.cache import Texts, cache_folder, physics_cache, remove_old
+from jaxpg.store import cache_folder, texts
+from jaxpg.store.cache import physics_cache
 
 MODEL = envs.REGISTRY["pendulum"].build().model
 ENDS = ("qpos", "qvel", "ctrl"), ("qpos", "qvel")
@@ -125,8 +125,7 @@ print("mujoco.mjx" in sys.modules)
 
 @pytest.mark.parametrize("damage", [lambda text: text[:-9], lambda text: text.replace(b"8", b"9", 1), lambda text: b""])
 def test_a_damaged_file_is_made_anew(folder, made, damage):
-    texts = Texts(cache_folder())
-    with kept_in(texts):
+    with kept_in(texts.find("physics")):
         program = step.scalar_program(MODEL, *ENDS)
         (path,) = folder.iterdir()
         path.write_bytes(damage(path.read_bytes()))
@@ -155,11 +154,11 @@ def test_no_folder_is_no_mistake(monkeypatch, tmp_path, made):
 
 
 def test_old_ones_are_removed(folder):
-    Texts(cache_folder()).write("name", "text")
+    texts.find("physics").write("name", "text")
     (path,) = folder.iterdir()
-    remove_old(cache_folder(), now=path.stat().st_mtime + cache.MAX_AGE + 1)
+    cache_folder.remove_old(cache_folder.locate(), now=path.stat().st_mtime + cache_folder.MAX_AGE + 1)
     assert list(folder.iterdir()) == []
-    assert Texts(cache_folder()).read("name") is None
+    assert texts.find("physics").read("name") is None
 
 
 def test_numbers_of_every_kind():

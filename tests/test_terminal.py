@@ -11,7 +11,7 @@ import pytest
 from rich.console import Console
 
 from jaxpg.run import terminal
-from jaxpg.store import cache, stderr
+from jaxpg.store import durations, stderr
 from jaxpg.store.stderr import filter_stderr
 
 LINE = {"update": 2, "steps": 50, "return": -3.0, "eval_return": -2.5, "seconds": 1.0}
@@ -72,8 +72,8 @@ def test_how_long_it_takes_is_known_the_next_time(monkeypatch, tmp_path):
 
     def said(what, seconds):
         clock = iter([0.0, seconds])
-        monkeypatch.setattr(cache.time, "monotonic", lambda: next(clock))
-        with cache.timed(True, what) as words:
+        monkeypatch.setattr(durations.time, "monotonic", lambda: next(clock))
+        with durations.record_duration(True, what) as words:
             return words
 
     new = "for the first time here"
@@ -85,7 +85,7 @@ def test_how_long_it_takes_is_known_the_next_time(monkeypatch, tmp_path):
 def test_without_a_cache_nothing_is_known_or_kept(monkeypatch, tmp_path):
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     for _ in range(2):
-        with cache.timed(False, "a") as words:
+        with durations.record_duration(False, "a") as words:
             assert words == "for the first time here"
     assert not list(tmp_path.iterdir())
 

@@ -16,8 +16,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from envs.physics.arrays import as_objects, choose_array, is_numeric, pack, promote
 from envs.physics.expressions import Expression, Graph
-from envs.physics.rules import RULES, UnsupportedPrimitive, as_objects, choose_array, is_numeric, pack
+from envs.physics.primitives import UnsupportedPrimitive
+from envs.physics.rules import RULES
 from envs.physics.stages import Stage, in_kernels, in_order, make_stages, run, separately
 
 
@@ -215,9 +217,9 @@ def _scan(operands, wanted, *, jaxpr, length, reverse, **groups):
         carry = results[:num_carry]
         rows.append(results[num_carry:])
     rows = rows[::-1] if reverse else rows
-    stacked = [
-        np.stack(column if is_numeric(*column) else list(map(as_objects, column))) for column in zip(*rows, strict=True)
-    ] or [np.zeros((0, *var.aval.shape), var.aval.dtype) for var in jaxpr.jaxpr.outvars[num_carry:]]
+    stacked = [np.stack(promote(*column)) for column in zip(*rows, strict=True)] or [
+        np.zeros((0, *var.aval.shape), var.aval.dtype) for var in jaxpr.jaxpr.outvars[num_carry:]
+    ]
     return [*carry, *stacked]
 
 

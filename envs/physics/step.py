@@ -21,7 +21,7 @@ from envs.physics.fields import MODEL, STATE, as_arguments, check_names, types_o
 from envs.physics.interpreter import Program, trace
 from envs.physics.models import import_mjx, model_digest, model_name, put_model
 from envs.physics.obstacles import likely_obstacles, obstacles
-from envs.physics.rules import UnsupportedPrimitive
+from envs.physics.primitives import UnsupportedPrimitive
 from envs.physics.stages import Stage
 from envs.physics.storage import kept, name_of
 from envs.physics.tiles import in_tiles

@@ -19,10 +19,11 @@ from typing import TYPE_CHECKING, Any, Protocol
 import jax
 import numpy as np
 
-from envs.physics.expressions import NUMPY, Expression, Graph
+from envs.physics.arrays import as_objects, pack
+from envs.physics.expressions import Expression, Graph
+from envs.physics.folding import NUMPY
 from envs.physics.interpreter import Program
 from envs.physics.models import model_digest
-from envs.physics.rules import as_objects, pack
 
 if TYPE_CHECKING:
     import mujoco
@@ -74,7 +75,7 @@ def name_of(model: mujoco.MjModel, inputs: tuple[str, ...], outputs: tuple[str, 
 def _makers() -> tuple[str, ...]:
     """What makes a program of a model: the packages' versions and the text of this one."""
     versions = (importlib.metadata.version(name) for name in ("jax", "mujoco", "mujoco-mjx", "numpy"))
-    sources = sorted(Path(__file__).parent.glob("*.py"))
+    sources = sorted(Path(__file__).parent.rglob("*.py"))
     return (*versions, hashlib.sha256(b"".join(path.read_bytes() for path in sources)).hexdigest())
 
 

@@ -26,7 +26,8 @@ from jaxpg.run.loop import Loop, Session, count_updates, is_solved
 from jaxpg.run.signals import StopRequests
 from jaxpg.run.terminal import Display
 from jaxpg.store import config_file, folder, lock, results, same_run, versions
-from jaxpg.store.cache import compilation_cache, physics_cache, timed
+from jaxpg.store.cache import compilation_cache, physics_cache
+from jaxpg.store.durations import record_duration
 from jaxpg.store.folder import RunFolder
 from jaxpg.store.lines import select_until
 from jaxpg.store.loggers import follower
@@ -204,7 +205,7 @@ def _compile(session: Session, env: Any, resumed: bool = False) -> tuple[Program
     what = f"{config.choices['algo']} on {config.task}, network={config.choices['network']}"
     name = f"{what} {config.num_shards} {config.run.vmap_seeds} {resumed}"
     with (
-        timed(config.run.cache, name) as before,
+        record_duration(config.run.cache, name) as before,
         display.show_status(f"compiling {what} ({before})"),
         compilation_cache(config.run.cache, display.say),
     ):

@@ -6,6 +6,7 @@ from collections.abc import Callable
 
 from jaxpg.config.configuration import Config
 from jaxpg.program.state import RunState
+from jaxpg.store.checkpoint_errors import SaveError
 from jaxpg.store.folder import RunFolder
 from jaxpg.store.metrics_log import MetricsLog
 
@@ -51,8 +52,6 @@ class Keeper:
 
     def _try_save(self, update: int, state: RunState, log: MetricsLog) -> str | None:
         """Saves; returns the reason if it fails."""
-        from jaxpg.store.checkpoint import SaveError
-
         try:
             log.flush()  # first: without its lines, a resumed run would have a gap
             if self._last != update:  # else only the best policy is missing

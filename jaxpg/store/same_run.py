@@ -9,6 +9,7 @@ from envs.options import OptionError
 from jaxpg.config import configuration
 from jaxpg.config.configuration import Config
 from jaxpg.errors import UserError
+from jaxpg.store.checkpoint_errors import CheckpointError, OtherRunError
 from jaxpg.store.folder import RunFolder
 
 if TYPE_CHECKING:  # orbax is slow to import
@@ -40,8 +41,6 @@ def check_checkpoint(checkpoints: Checkpoints, number: int, config: Config) -> N
       OtherRunError: its options belong to another run.
       CheckpointError: it cannot be read, or has no options.
     """
-    from jaxpg.store.checkpoint import CheckpointError, OtherRunError
-
     where = checkpoints.folder / str(number)
     try:
         made_with = configuration.from_dict(checkpoints.record(number)["meta"]["config"])

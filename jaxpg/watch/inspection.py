@@ -11,7 +11,8 @@ from jaxpg.program.schedule import Schedule, plan
 from jaxpg.run.loop import is_solved
 from jaxpg.run.terminal import format_metric
 from jaxpg.store import config_file, folder, lock, same_run, versions
-from jaxpg.store.checkpoint import CheckpointError, Checkpoints
+from jaxpg.store.checkpoint import Checkpoints
+from jaxpg.store.checkpoint_errors import CheckpointError
 from jaxpg.store.folder import RunFolder, to_json
 from jaxpg.store.lines import select_until
 from jaxpg.store.results import best_returns, make_table

@@ -20,7 +20,7 @@ from jaxpg.commands.ending import run_command
 from jaxpg.config.entries import GROUPS
 from jaxpg.config.schema import Run
 from jaxpg.program import compile as program
-from jaxpg.store import cache
+from jaxpg.store import cache_folder
 
 BASE = {"env": "quadratic", "num_envs": 2, "total_steps": 32, "eval_episodes": 2, "env.episode_length": 4}
 BASE |= {"report": "false"}  # which takes longer than such a run
@@ -73,7 +73,7 @@ def command_lines(draw):
 @pytest.fixture(autouse=True)
 def quick_to_compile(monkeypatch, tmp_path):
     monkeypatch.setattr(program, "OPTIMIZED", program.RUN_ONCE)
-    monkeypatch.setattr(cache, "cache_folder", lambda: tmp_path / "cache" / "jaxpg")
+    monkeypatch.setattr(cache_folder, "locate", lambda: tmp_path / "cache" / "jaxpg")
 
 
 @rounds(FEW, MANY)

@@ -9,7 +9,8 @@ import shutil
 import numpy as np
 import pytest
 
-from jaxpg.store.checkpoint import CheckpointError, Checkpoints
+from jaxpg.store.checkpoint import Checkpoints
+from jaxpg.store.checkpoint_errors import CheckpointError
 
 FEW, MANY = range(20, 40), 200  # 27 is one that only the digests of the arrays tell
 STEPS = (1, 2, 3)

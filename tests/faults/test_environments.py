@@ -28,7 +28,7 @@ from envs.base import Interface, State
 from jaxpg import export, train
 from jaxpg.commands.ending import run_command
 from jaxpg.program import compile as program
-from jaxpg.store import cache, policies
+from jaxpg.store import cache_folder, policies
 
 FEW, MANY = 1, 26  # rounds, of a dozen examples and then of 20
 NAMES = ("x", "x", "x", "return", "reward", "value", "length", "success", "distance", "diverged", "update", "steps")
@@ -227,7 +227,7 @@ def check_finished(folder, output, said):
 @pytest.fixture(autouse=True)
 def quick_to_compile(monkeypatch, tmp_path):
     monkeypatch.setattr(program, "OPTIMIZED", program.RUN_ONCE)
-    monkeypatch.setattr(cache, "cache_folder", lambda: tmp_path / "cache" / "jaxpg")
+    monkeypatch.setattr(cache_folder, "locate", lambda: tmp_path / "cache" / "jaxpg")
 
 
 @rounds(FEW, MANY)

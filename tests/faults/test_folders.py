@@ -18,7 +18,7 @@ from in_process import contents, ended
 
 from jaxpg import compare, evaluate, export, inspect, report, train
 from jaxpg.config import configuration
-from jaxpg.store import cache, config_file
+from jaxpg.store import cache_folder, config_file
 from jaxpg.store.checkpoint import Checkpoints
 from jaxpg.store.folder import RunFolder, read_metrics
 
@@ -45,7 +45,7 @@ def runs(tmp_path_factory):
     """A run that was killed before its last checkpoint, another one, and the first as it ends undamaged."""
     folders = tmp_path_factory.mktemp("runs")
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(cache, "cache_folder", lambda: folders / "cache" / "jaxpg")
+        patch.setattr(cache_folder, "locate", lambda: folders / "cache" / "jaxpg")
         patch.setattr(gc, "freeze", lambda: None)  # as of a process that ends
         for name, seed in (("undisturbed", 0), ("other", 1)):
             status, _, error = ended(train.main, [*RUN, f"seed={seed}", f"run_dir={folders / name}"])

@@ -1,0 +1,46 @@
+"""Arrays of scalar expressions.
+
+An array is either numeric (all its elements are known) or of dtype object, with an `Expression` or a Python number in
+every place. Moving elements about is the same for both.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from envs.physics.expressions import Expression
+from envs.physics.primitives import choose
+
+Array = np.ndarray
+
+
+def is_numeric(*arrays: Array) -> bool:
+    """Whether all elements of all arrays are known."""
+    return all(array.dtype != object for array in arrays)
+
+
+def as_objects(x: Array) -> Array:
+    """The same elements as Python numbers and expressions."""
+    return x if x.dtype == object else x.astype(object)
+
+
+def promote(*arrays: Array) -> tuple[Array, ...]:
+    """The arrays as they are if all are numeric; else all of dtype object, so that elements can go from one to another.
+
+    >>> [x.dtype.kind for x in promote(np.ones(2), np.ones(2, object))]
+    ['O', 'O']
+    """
+    return arrays if is_numeric(*arrays) else tuple(map(as_objects, arrays))
+
+
+def pack(elements: list, shape: tuple[int, ...]) -> Array:
+    """An object array from its elements in order."""
+    array = np.empty(len(elements), object)
+    array[:] = elements
+    return array.reshape(shape)
+
+
+def choose_array(index: Expression, cases: list[Array], aval) -> Array:
+    """cases[index], the index clamped into the range."""
+    options = zip(*(as_objects(case).flat for case in cases), strict=True)
+    return pack([choose(index, *option, dtype=np.dtype(aval.dtype)) for option in options], aval.shape)

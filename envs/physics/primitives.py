@@ -1,0 +1,123 @@
+"""Jax's elementwise primitives on scalars, each simplified as far as it can be."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+from envs.physics.algebra import add, cos, div, integer_pow, mul, neg, power, sin, sub
+from envs.physics.expressions import Scalar, build, identity, is_constant, is_number, is_operation
+from envs.physics.folding import fold
+
+
+class UnsupportedPrimitive(ValueError):
+    """A primitive, or a use of one, that has no scalar form; the message begins with its name."""
+
+
+def apply(op: str, *args: Scalar, dtype: np.dtype, params: tuple = ()) -> Scalar:
+    """The simplified expression of a primitive in `folding.NUMPY`; a Python number if all operands are."""
+    if all(map(is_constant, args)):
+        return fold(op, *args, dtype=dtype, params=params)
+    if op == "select_n":
+        return select(*args, dtype=dtype)
+    simplify = SIMPLIFY.get(op)
+    if simplify is not None:
+        return simplify(*args, **dict(params))
+    return build(op, *args, dtype=dtype, params=params)
+
+
+def select(which: Scalar, on_false: Scalar, on_true: Scalar, *others: Scalar, dtype: np.dtype | None = None) -> Scalar:
+    """`on_true` where `which` holds, else `on_false`; of more cases the one with the number `which`."""
+    if others:
+        return choose(which, on_false, on_true, *others, dtype=dtype)
+    if is_constant(which):
+        return on_true if which else on_false
+    if identity(on_false) == identity(on_true):
+        return on_true
+    if on_false is False and on_true is True:
+        return which
+    if is_operation(which, "not"):
+        return select(which.args[0], on_true, on_false, dtype=dtype)
+    return build("select_n", which, on_false, on_true, dtype=dtype)
+
+
+def choose(index: Scalar, *cases: Scalar, dtype: np.dtype) -> Scalar:
+    """cases[index], the index clamped into the range."""
+    chosen = cases[0]
+    for at, case in enumerate(cases[1:], start=1):
+        chosen = select(apply("ge", index, at, dtype=np.dtype(bool)), chosen, case, dtype=dtype)
+    return chosen
+
+
+def maximum(x: Scalar, y: Scalar) -> Scalar:
+    """max(x, y); max(-inf, x) = x."""
+    if is_constant(y):
+        x, y = y, x
+    return y if x is y or is_number(x, -math.inf) else build("max", x, y)
+
+
+def minimum(x: Scalar, y: Scalar) -> Scalar:
+    """min(x, y); min(inf, x) = x."""
+    if is_constant(y):
+        x, y = y, x
+    return y if x is y or is_number(x, math.inf) else build("min", x, y)
+
+
+def clamp(low: Scalar, x: Scalar, high: Scalar) -> Scalar:
+    """min(max(x, low), high)."""
+    return minimum(high, maximum(low, x))
+
+
+def logical_and(x: Scalar, y: Scalar) -> Scalar:
+    """x and y, of truth values or bit by bit; x and x = x."""
+    if is_constant(x):
+        x, y = y, x
+    if x is y or y is True:
+        return x
+    return False if y is False else build("and", x, y)
+
+
+def logical_or(x: Scalar, y: Scalar) -> Scalar:
+    """x or y, of truth values or bit by bit; x or x = x."""
+    if is_constant(x):
+        x, y = y, x
+    if x is y or y is False:
+        return x
+    return True if y is True else build("or", x, y)
+
+
+def logical_not(x: Scalar) -> Scalar:
+    """not x, of a truth value or bit by bit; not not x = x."""
+    return x.args[0] if x.op == "not" else build("not", x)
+
+
+def convert(x: Scalar, new_dtype: np.dtype) -> Scalar:
+    """x in another dtype; nothing happens where it has that one."""
+    if x.dtype == new_dtype:
+        return x
+    dtype = np.dtype(new_dtype)
+    return build("convert_element_type", x, dtype=dtype, params=(("new_dtype", dtype),))
+
+
+SIMPLIFY: dict[str, Callable[..., Any]] = {
+    "add": add,
+    "sub": sub,
+    "mul": mul,
+    "div": div,
+    "neg": neg,
+    "pow": power,
+    "integer_pow": integer_pow,
+    "square": lambda x: mul(x, x),
+    "sin": sin,
+    "cos": cos,
+    "max": maximum,
+    "min": minimum,
+    "clamp": clamp,
+    "and": logical_and,
+    "or": logical_or,
+    "not": logical_not,
+    "convert_element_type": convert,
+}
