@@ -364,6 +364,16 @@ def test_what_is_in_place_of_a_file_is_said_in_one_line(run, name, kind, reader)
         assert (name if reader != "compare" else "") in one_line(ending)
 
 
+@pytest.mark.parametrize("reader", COMMANDS)
+def test_a_run_in_a_later_format_is_refused_in_one_line(run, reader):
+    recorded = json.loads((run / "versions.json").read_text())
+    assert recorded["format"] == folder.FORMAT
+    (run / "versions.json").write_text(json.dumps(recorded | {"format": folder.FORMAT + 1}))
+    module, arguments = COMMANDS[reader]
+    error = one_line(ended(module.main, [argument.format(run=run) for argument in arguments]))
+    assert f"written by a later jaxpg (format {folder.FORMAT + 1}; this one reads up to {folder.FORMAT})" in error
+
+
 @pytest.mark.parametrize("name", ["config.yaml", "versions.json", "metrics.jsonl", "checkpoints", "best", "."])
 def test_what_may_not_be_read_is_said_in_one_line(command_environment, run, name):
     os.chmod(run / name, 0)
@@ -402,7 +412,7 @@ def test_another_commit_is_noted_and_not_as_other_bits(run):
     assert "note: commit was 0123abc and is " in out
     assert "not the same bits" not in out
     assert json.loads((run / "versions.json").read_text())["earlier"] == [recorded | {"commit": "0123abc"}]
-    for name in ("jaxpg", "commit", "earlier"):  # as a run of earlier days
+    for name in ("format", "jaxpg", "commit", "earlier"):  # as a run of earlier days
         recorded.pop(name, None)
     (run / "versions.json").write_text(json.dumps(recorded))
     assert "commit was" not in ended(train.main, [f"resume={run}", "total_steps=160"])[1]

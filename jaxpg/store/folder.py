@@ -37,6 +37,7 @@ from jaxpg.store.versions import collect_versions
 
 MAX_TASK_LENGTH = 100  # characters of the task in a folder's name: file systems allow 255 bytes
 PATTERN_CHARACTERS = "\\[]*?"  # characters with a special meaning in paths of orbax and tensorstore
+FORMAT = 1  # of run folders, in versions.json; raised by a change that earlier versions cannot read
 MAX_THREADS = 4096  # that versions.json can request: more than any machine has cores
 
 
@@ -210,15 +211,31 @@ def read(path: Path) -> str:
 
 
 def find(path: str) -> RunFolder:
-    """The run folder at `path`; raises UserError if there is none."""
+    """The run folder at `path`; raises UserError if there is none, or only a later jaxpg can read it."""
     folder = RunFolder(path)
     if not _has_config(folder):
         raise UserError(f"{path} is not a run folder: it has no config.yaml")
     return folder
 
 
+def _check_format(folder: RunFolder) -> None:
+    """Raises UserError if the run has a later format; whether `versions.json` is sound is not asked here."""
+    with contextlib.suppress(OSError, ValueError, RecursionError):
+        recorded = json.loads(files.read(folder.versions))
+        written = recorded.get("format", FORMAT) if isinstance(recorded, dict) else FORMAT
+        if type(written) is int and written > FORMAT:
+            raise UserError(
+                f"{folder.path} was written by a later jaxpg (format {written}; this one reads up to {FORMAT}): update "
+                "jaxpg to use it"
+            )
+
+
 def _has_config(folder: RunFolder) -> bool:
-    """Whether there is a `config.yaml`; raises UserError if that cannot be found out, or it is not a file."""
+    """Whether there is a `config.yaml`.
+
+    Raises:
+      UserError: that cannot be found out, it is not a file, or a later jaxpg has written the run.
+    """
     try:
         mode = os.lstat(folder.config).st_mode
     except (FileNotFoundError, NotADirectoryError):
@@ -228,18 +245,20 @@ def _has_config(folder: RunFolder) -> bool:
     if not stat.S_ISREG(mode):
         reason = files.LINK_REFUSED if stat.S_ISLNK(mode) else "it is not a file"
         raise UserError(f"{folder.config}: cannot be read ({reason})")
+    _check_format(folder)
     return True
 
 
 def write_versions(folder: RunFolder) -> None:
     """Writes `versions.json`, the first file of a run."""
-    replace(folder.versions, json.dumps(collect_versions(), indent=1))
+    replace(folder.versions, json.dumps({"format": FORMAT, **collect_versions()}, indent=1))
 
 
 def change_versions(folder: RunFolder, recorded: dict[str, Any], now: dict[str, Any]) -> None:
     """Records the versions that continue a run; the previous ones stay in `versions.json` as `earlier`."""
     previous = {name: value for name, value in recorded.items() if name != "earlier"}
-    replace(folder.versions, json.dumps({**now, "earlier": [*recorded.get("earlier", []), previous]}, indent=1))
+    earlier = [*recorded.get("earlier", []), previous]
+    replace(folder.versions, json.dumps({"format": FORMAT, **now, "earlier": earlier}, indent=1))
 
 
 def read_versions(folder: RunFolder) -> dict[str, Any]:
