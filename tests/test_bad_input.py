@@ -288,7 +288,10 @@ DAMAGES = {
     "other environment in config.yaml": (edit_config("id: pendulum", "id: arm"), "unknown option"),
     "config.yaml that is no YAML": (edit_config("env:", "env: ["), "not a configuration of a run"),
     "versions.json torn": (other_versions, "cannot be read"),
-    "versions.json of another kind": (lambda folder: (folder / "versions.json").write_text("[]"), "not what a run"),
+    "versions.json of another kind": (
+        lambda folder: (folder / "versions.json").write_text("[]"),
+        "not written by a run",
+    ),
     "threads in words": (
         lambda folder: (folder / "versions.json").write_text('{"threads": "two"}'),
         "not written by a run: expected an object with threads from 1 to ",

@@ -167,7 +167,7 @@ def test_an_observation_out_of_bounds_ends_in_one_line(program, tmp_path):
     said = result.stdout + result.stderr
     assert "observation 0 (observation_0) is " in said
     assert "e+19 after a reset" in said or "e+20 after a reset" in said
-    assert "in units in which it is smaller" in said
+    assert "choose units in which it is smaller" in said
     assert "Traceback" not in said
     assert not (tmp_path / "run" / "metrics.jsonl").exists()
 
