@@ -17,7 +17,7 @@ from processes import RUN, bound_by_permissions, outcome, proceed, stop_after, t
 
 from jaxpg import compare, evaluate, export, inspect, report, train
 from jaxpg.errors import UserError
-from jaxpg.store import cache_folder, files, folder, lines, lock, versions
+from jaxpg.store import cache_folder, files, folder, lines, lock, run_files, versions, versions_file
 from jaxpg.store.checkpoint import Checkpoints
 from jaxpg.store.checkpoint_errors import CheckpointError, SaveError
 from jaxpg.store.folder import RunFolder, read_metrics
@@ -109,7 +109,7 @@ def test_checkpoints_are_in_the_folder_that_is_owned_or_nowhere(system, tmp_path
         else:
             with pytest.raises(SaveError, match="the folder was moved or removed"):
                 checkpoints.save(2, {"x": np.arange(3.0)}, {})
-        folder.replace(run_folder.report, "page")
+        run_files.replace(run_folder.report, "page")
     assert tree(tmp_path / "run") == {}
     assert (away / "report.html").read_text() == "page"
     assert Checkpoints(away / "checkpoints", read_only=True).numbers() == ([2, 1] if system == "Linux" else [1])
@@ -168,12 +168,12 @@ def test_a_file_is_replaced_whole_and_leaves_nothing_else(tmp_path, outside):
     for content in ("text", b"bytes\xff", "a name that is no text: \udcff"):
         (tmp_path / "file").unlink(missing_ok=True)
         (tmp_path / "file").symlink_to(outside / "file")
-        folder.replace(tmp_path / "file", content)
+        run_files.replace(tmp_path / "file", content)
         assert not (tmp_path / "file").is_symlink()
     assert (tmp_path / "file").read_text() == "a name that is no text: \\udcff"
     assert (outside / "file").read_text() == "not yours\n"
     with pytest.raises(UserError, match=r"outside: cannot be written \(Is a directory\)"):
-        folder.replace(outside, "text")
+        run_files.replace(outside, "text")
     assert sorted(path.name for path in tmp_path.iterdir()) == ["file", "outside"]
     mask = os.umask(0)
     os.umask(mask)
@@ -346,7 +346,7 @@ DAMAGES = {
     "a deep list": lambda path: path.write_text("[" * 5000),
     "earlier versions that are none": lambda path: path.write_text('{"threads": 1, "jaxlib": "0", "earlier": 5}'),
     "earlier versions in words": lambda path: path.write_text('{"threads": 1, "jaxlib": "0", "earlier": ["old"]}'),
-    "too many threads": lambda path: path.write_text(f'{{"threads": {folder.MAX_THREADS + 1}, "jaxlib": "0"}}'),
+    "too many threads": lambda path: path.write_text(f'{{"threads": {versions_file.MAX_THREADS + 1}, "jaxlib": "0"}}'),
 }
 COMMANDS = READERS | {"inspect": (inspect, ["run={run}"]), "compare": (compare, ["{run}", "out={run}/page.html"])}
 
@@ -367,11 +367,14 @@ def test_what_is_in_place_of_a_file_is_said_in_one_line(run, name, kind, reader)
 @pytest.mark.parametrize("reader", COMMANDS)
 def test_a_run_in_a_later_format_is_refused_in_one_line(run, reader):
     recorded = json.loads((run / "versions.json").read_text())
-    assert recorded["format"] == folder.FORMAT
-    (run / "versions.json").write_text(json.dumps(recorded | {"format": folder.FORMAT + 1}))
+    assert recorded["format"] == versions_file.FORMAT
+    (run / "versions.json").write_text(json.dumps(recorded | {"format": versions_file.FORMAT + 1}))
     module, arguments = COMMANDS[reader]
     error = one_line(ended(module.main, [argument.format(run=run) for argument in arguments]))
-    assert f"written by a later jaxpg (format {folder.FORMAT + 1}; this one reads up to {folder.FORMAT})" in error
+    assert (
+        f"written by a later jaxpg (format {versions_file.FORMAT + 1}; this one reads up to {versions_file.FORMAT})"
+        in error
+    )
 
 
 @pytest.mark.parametrize("name", ["config.yaml", "versions.json", "metrics.jsonl", "checkpoints", "best", "."])

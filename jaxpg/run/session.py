@@ -25,7 +25,7 @@ from jaxpg.program.state import RunState
 from jaxpg.run.loop import Loop, Session, count_updates, is_solved
 from jaxpg.run.signals import StopRequests
 from jaxpg.run.terminal import Display
-from jaxpg.store import config_file, folder, lock, results, same_run, versions
+from jaxpg.store import config_file, folder, lock, results, run_files, same_run, versions, versions_file
 from jaxpg.store.cache import compilation_cache, physics_cache
 from jaxpg.store.durations import record_duration
 from jaxpg.store.folder import RunFolder
@@ -77,8 +77,8 @@ def begin(config: Config, finish: Finish, check: Callable[[RunFolder], None] = f
 
 def _begin(config: Config, finish: Finish, env: Any, run_folder: RunFolder) -> int:
     schedule, run = plan(config), config.run
-    folder.write_versions(run_folder)
-    folder.replace(run_folder.config, configuration.to_yaml(config))
+    versions_file.write(run_folder.versions)
+    run_files.replace(run_folder.config, configuration.to_yaml(config))
     display = Display(schedule.total_steps, num_agents=config.num_agents)
     display.say(
         f"{agents.described(config)}: {run.num_envs} environments x {run.num_steps} steps x "
@@ -138,7 +138,7 @@ def begin_or_resume(config: Config, finish: Finish) -> int:
 def _continue(stored: Config, config: Config, finish: Finish, run_folder: RunFolder) -> int:
     from jaxpg.store.checkpoint import Checkpoints
 
-    recorded_versions = folder.read_versions(run_folder)
+    recorded_versions = versions_file.read(run_folder.versions)
     follower.check_installed(config.run.loggers)
     prepare(config, recorded_versions.get("threads"))  # before orbax, which starts the backend too
     checkpoints = Checkpoints(run_folder.checkpoints)
@@ -161,9 +161,9 @@ def _continue(stored: Config, config: Config, finish: Finish, run_folder: RunFol
     state = checkpoints.restore(update, program.state_shape)
     if config.run.nan_policy == "skip":
         state = state._replace(train=_align_updates(state.train))
-    folder.replace(run_folder.config, configuration.to_yaml(config))
+    run_files.replace(run_folder.config, configuration.to_yaml(config))
     if changes:
-        folder.change_versions(run_folder, recorded_versions, current_versions)
+        versions_file.change(run_folder.versions, recorded_versions, current_versions)
     return _train(session, finish, program, state, seconds)
 
 

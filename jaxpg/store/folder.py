@@ -17,7 +17,6 @@ from __future__ import annotations
 
 import contextlib
 import itertools
-import json
 import os
 import re
 import stat
@@ -30,15 +29,12 @@ import numpy as np
 
 from jaxpg.config.configuration import Config
 from jaxpg.errors import UserError
-from jaxpg.store import files, lock
+from jaxpg.store import files, lock, versions_file
 from jaxpg.store.files import UNFINISHED
 from jaxpg.store.lines import parse_lines
-from jaxpg.store.versions import collect_versions
 
 MAX_TASK_LENGTH = 100  # characters of the task in a folder's name: file systems allow 255 bytes
 PATTERN_CHARACTERS = "\\[]*?"  # characters with a special meaning in paths of orbax and tensorstore
-FORMAT = 1  # of run folders, in versions.json; raised by a change that earlier versions cannot read
-MAX_THREADS = 4096  # that versions.json can request: more than any machine has cores
 
 
 class RunFolder:
@@ -133,7 +129,7 @@ def _list_names(path: Path) -> list[str]:
 def _is_run(folder: RunFolder) -> bool:
     """Whether one of our runs began there: it writes `versions.json` first."""
     try:
-        return "jaxlib" in read_versions(folder)
+        return "jaxlib" in versions_file.read(folder.versions)
     except UserError:
         return False
 
@@ -179,55 +175,12 @@ def _report_errors(path: Path) -> Iterator[None]:
         raise UserError(f"{path}: cannot write a run folder there ({error.strerror})") from error
 
 
-def replace(path: str | Path, content: str | bytes) -> None:
-    """Replaces a file atomically, see `files.replace`.
-
-    Args:
-      path: the file, in an existing folder.
-      content: text is written as UTF-8, with lone surrogates, which file names may contain, as escapes.
-
-    Raises:
-      UserError: the file cannot be written.
-    """
-    data = content.encode("utf-8", "backslashreplace") if isinstance(content, str) else content
-    try:
-        files.replace(Path(path), data)
-    except OSError as error:
-        raise UserError(f"{path}: cannot be written ({error.strerror})") from error
-
-
-def read(path: Path) -> str:
-    """The text of a file.
-
-    Raises:
-      UserError: it is missing, not a file, not text, or a link in a run folder.
-    """
-    try:
-        return files.read(path).decode()
-    except OSError as error:
-        raise UserError(f"{path}: cannot be read ({error.strerror})") from error
-    except UnicodeDecodeError as error:
-        raise UserError(f"{path}: cannot be read (it is not UTF-8 text)") from error
-
-
 def find(path: str) -> RunFolder:
     """The run folder at `path`; raises UserError if there is none, or only a later jaxpg can read it."""
     folder = RunFolder(path)
     if not _has_config(folder):
         raise UserError(f"{path} is not a run folder: it has no config.yaml")
     return folder
-
-
-def _check_format(folder: RunFolder) -> None:
-    """Raises UserError if the run has a later format; whether `versions.json` is sound is not asked here."""
-    with contextlib.suppress(OSError, ValueError, RecursionError):
-        recorded = json.loads(files.read(folder.versions))
-        written = recorded.get("format", FORMAT) if isinstance(recorded, dict) else FORMAT
-        if type(written) is int and written > FORMAT:
-            raise UserError(
-                f"{folder.path} was written by a later jaxpg (format {written}; this one reads up to {FORMAT}): update "
-                "jaxpg to use it"
-            )
 
 
 def _has_config(folder: RunFolder) -> bool:
@@ -245,39 +198,8 @@ def _has_config(folder: RunFolder) -> bool:
     if not stat.S_ISREG(mode):
         reason = files.LINK_REFUSED if stat.S_ISLNK(mode) else "it is not a file"
         raise UserError(f"{folder.config}: cannot be read ({reason})")
-    _check_format(folder)
+    versions_file.check_format(folder.versions)
     return True
-
-
-def write_versions(folder: RunFolder) -> None:
-    """Writes `versions.json`, the first file of a run."""
-    replace(folder.versions, json.dumps({"format": FORMAT, **collect_versions()}, indent=1))
-
-
-def change_versions(folder: RunFolder, recorded: dict[str, Any], now: dict[str, Any]) -> None:
-    """Records the versions that continue a run; the previous ones stay in `versions.json` as `earlier`."""
-    previous = {name: value for name, value in recorded.items() if name != "earlier"}
-    earlier = [*recorded.get("earlier", []), previous]
-    replace(folder.versions, json.dumps({"format": FORMAT, **now, "earlier": earlier}, indent=1))
-
-
-def read_versions(folder: RunFolder) -> dict[str, Any]:
-    """The contents of `versions.json`; raises UserError if it cannot be read or is malformed."""
-    try:
-        recorded = json.loads(read(folder.versions))
-    except (ValueError, RecursionError) as error:
-        raise UserError(f"{folder.versions}: cannot be read ({error})") from error
-    if not isinstance(recorded, dict) or not _is_number_of_threads(recorded.get("threads", 1)):
-        expected = f"expected an object with threads from 1 to {MAX_THREADS}"
-        raise UserError(f"{folder.versions}: not written by a run: {expected}")
-    earlier = recorded.get("earlier", [])
-    if not isinstance(earlier, list) or not all(isinstance(part, dict) for part in earlier):
-        raise UserError(f"{folder.versions}: not written by a run: expected a list of objects as earlier")
-    return recorded
-
-
-def _is_number_of_threads(value: Any) -> bool:
-    return type(value) is int and 1 <= value <= MAX_THREADS
 
 
 def read_metrics(folder: RunFolder, agents: int | None = None) -> list[dict[str, Any]]:

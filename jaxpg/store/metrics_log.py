@@ -9,11 +9,12 @@ from functools import partial
 from typing import Any
 
 from jaxpg.store import files
-from jaxpg.store.folder import RunFolder, read_metrics_text, replace
+from jaxpg.store.folder import RunFolder, read_metrics_text
 from jaxpg.store.lines import format_line, parse_lines, select_until
 from jaxpg.store.loggers import SafeLogger, mean_values
 from jaxpg.store.loggers.follower import Follower
 from jaxpg.store.loggers.tensorboard import TensorBoard
+from jaxpg.store.run_files import replace
 
 
 class MetricsLog:

@@ -14,7 +14,7 @@ from jaxpg.program import agents
 from jaxpg.run.loop import Session
 from jaxpg.run.session import Times
 from jaxpg.run.terminal import format_metric
-from jaxpg.store import folder, results
+from jaxpg.store import folder, results, run_files
 from jaxpg.store.folder import to_json
 from jaxpg.store.statistics import finite_mean
 from jaxpg.watch import figures
@@ -85,4 +85,4 @@ def _draw_curve(session: Session, lines: list[dict[str, Any]]) -> None:
         figures.draw_sweep_curves(lines, picture, title, results.select_curves(config, lines))
     else:
         figures.draw_learning_curve(lines, picture, title)
-    folder.replace(session.run_folder.learning_curve, picture.getvalue())
+    run_files.replace(session.run_folder.learning_curve, picture.getvalue())

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from jaxpg.errors import UserError
-from jaxpg.store import folder, results
+from jaxpg.store import results, run_files
 from jaxpg.store.statistics import (
     has_interval,
     improvement_interval,
@@ -33,7 +33,7 @@ def write(paths: Sequence[str], out: Path, say: Callable[[str], None]) -> None:
     """
     writer = _find_writer(out)
     methods = read_methods(paths)
-    folder.replace(out, writer(methods))
+    run_files.replace(out, writer(methods))
     rows = [list_columns(methods), *make_table(methods)]
     widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
     for row in rows:

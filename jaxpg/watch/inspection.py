@@ -10,7 +10,7 @@ from jaxpg.program.backend import prepare
 from jaxpg.program.schedule import Schedule, plan
 from jaxpg.run.loop import is_solved
 from jaxpg.run.terminal import format_metric
-from jaxpg.store import config_file, folder, lock, same_run, versions
+from jaxpg.store import config_file, folder, lock, same_run, versions, versions_file
 from jaxpg.store.checkpoint import Checkpoints
 from jaxpg.store.checkpoint_errors import CheckpointError
 from jaxpg.store.folder import RunFolder, to_json
@@ -63,7 +63,7 @@ def inspect(path: str) -> Inspection:
     update = sound[0] if sound else 0
     schedule = plan(config)
     best_of_checkpoint = best_returns(select_until(lines, update))
-    recorded = folder.read_versions(run_folder)
+    recorded = versions_file.read(run_folder.versions)
     return Inspection(
         run_folder=run_folder,
         config=config,

@@ -20,7 +20,7 @@ import numpy as np
 
 from envs.hints import pip_install
 from jaxpg.errors import UserError
-from jaxpg.store.folder import replace
+from jaxpg.store.run_files import replace
 
 TICK = Fraction(1, 100)  # of a GIF's clock [s]
 MIN_TICKS = 2  # per picture: browsers slow down a GIF with 1

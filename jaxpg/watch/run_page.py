@@ -15,7 +15,7 @@ from jaxpg.config.configuration import Config
 from jaxpg.program import agents
 from jaxpg.program.compile import SELECTION_SEED
 from jaxpg.run.terminal import format_metric
-from jaxpg.store import config_file, folder, policies, results
+from jaxpg.store import config_file, folder, policies, results, run_files, versions_file
 from jaxpg.store.cache import compilation_cache, physics_cache
 from jaxpg.store.folder import RunFolder
 from jaxpg.store.policies import StoredPolicy
@@ -63,7 +63,7 @@ def write_report(path: str, agent: int | None, cache: bool, say: Callable[[str],
             stages["last"] = last
         data = build_report(run_folder, config_file.load(run_folder.config), stages)
     content = make_page(data)
-    folder.replace(run_folder.report, content)
+    run_files.replace(run_folder.report, content)
     for line in data["notes"]:
         say(f"note: {run_folder.report.name} has {line}")
     say(f"{run_folder.report}: {len(content) / 1000:,.0f} kB, open it in a browser")
@@ -197,7 +197,7 @@ def _list_options(config: Config) -> list[list[str | None]]:
 
 def _list_versions(run_folder: RunFolder) -> list[list[str]]:
     """The versions that computed the run, with earlier ones if they differ."""
-    recorded = folder.read_versions(run_folder)
+    recorded = versions_file.read(run_folder.versions)
     all_parts = [*recorded.pop("earlier", []), recorded]
     return [[name, ", then ".join(dict.fromkeys(str(part.get(name)) for part in all_parts))] for name in recorded]
 
