@@ -1,6 +1,6 @@
-"""Baselines: what is subtracted from a return to make the gradient vary less without changing its mean.
+"""Baselines: subtracted from the return, they reduce the variance of the gradient without changing its mean.
 
-    grad J = E[sum_t grad log pi(a_t | s_t) (G_t - b_t)]      for every b_t that does not depend on a_t
+    grad J = E[sum_t grad log pi(a_t | s_t) (G_t - b_t)]      for every b_t independent of a_t
 
 | function        | b_t of trajectory i              | bias of the gradient   | when to use                     |
 |-----------------|----------------------------------|------------------------|---------------------------------|
@@ -10,12 +10,12 @@
 | `leave_one_out` | mean of the other trajectories   | none                   | small batches                   |
 | V(s_t)          | a learned value                  | none                   | returns depend on the state     |
 
-N is the number of trajectories; the first three hold the trajectory's own return. All take returns `[T, N]`, time
-first, and give an array of that shape. A learned value is no function of returns: it comes from a network, and is
-free of bias as long as it was not fitted to the trajectories that it is subtracted from.
+N is the number of trajectories; the first three include the trajectory's own return. All take returns `[T, N]`, time
+first, and return an array of that shape. A learned value comes from a network instead, and is unbiased as long as it
+was not fitted to the same trajectories.
 
-`jaxpg.methods.reinforce` takes any `Baseline`. `critic` and `zero` are baselines as they are, `of_returns` and
-`of_scores` make one of the functions above.
+`jaxpg.methods.reinforce` takes any `Baseline`. `critic` and `zero` are baselines themselves; `of_returns` and
+`of_scores` make one from a function above.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ import jax.numpy as jnp
 
 from jaxpg.shapes import broadcast_scalar, check_shape
 
-# baseline(returns, weight, value, squared_score) -> what is subtracted from the returns
+# baseline(returns, weight, value, squared_score) -> b_t
 Baseline = Callable[[jax.Array, jax.Array, jax.Array, jax.Array], jax.Array | float]
 
 
@@ -36,18 +36,18 @@ def batch_mean(returns: jax.Array, weight: jax.Array | float = 1.0) -> jax.Array
 
         b = sum_{t,i} w_{t,i} G_{t,i} / sum_{t,i} w_{t,i}
 
-    The mean contains the sample itself: a bias of the order of 1/N for N trajectories, and the factor 1 - 1/N in
-    episodes of one step.
+    The mean includes the sample itself, which gives a bias of the order of 1/N for N trajectories; in episodes of one
+    step it is the factor 1 - 1/N.
 
     Args:
       returns: G_t, `[T, ...]`.
-      weight: 1 where the step belongs to the episode and 0 after its end, `[T, ...]` or a scalar. Where nothing counts
-        that a mean would be of, it is 0.
+      weight: 1 if the step belongs to the episode and 0 after its end, `[T, ...]` or a scalar. A mean over no steps
+        is 0.
 
     Raises:
       ValueError: the weight's shape does not fit.
 
-    Source: the lesson, section 3.1 (a baseline that is the same for every state).
+    Source: the lesson, section 3.1 (the same baseline for every state).
 
     >>> batch_mean(jnp.array([3.0, 2.0])).tolist()
     [2.5, 2.5]
@@ -61,11 +61,11 @@ def time_mean(returns: jax.Array, weight: jax.Array | float = 1.0) -> jax.Array:
 
         b_t = sum_i w_{t,i} G_{t,i} / sum_i w_{t,i}
 
-    It contains the sample itself, which shrinks the expected gradient by exactly 1 - 1/N where all N trajectories last.
+    It includes the sample itself, which shrinks the expected gradient by exactly 1 - 1/N while all N trajectories last.
 
     Args:
       returns: G_t, `[T, ...]`.
-      weight: as in `batch_mean`; at a step that counts for nobody b_t is 0.
+      weight: as in `batch_mean`; b_t is 0 at a step with no weight.
 
     Raises:
       ValueError: the weight's shape does not fit.
@@ -81,14 +81,14 @@ def leave_one_out(returns: jax.Array, weight: jax.Array | float = 1.0) -> jax.Ar
 
         b_i = sum_{t, j != i} w_{t,j} G_{t,j} / sum_{t, j != i} w_{t,j}
 
-    Independent of trajectory i, and so exactly unbiased for every N.
+    It is independent of trajectory i, so it is exactly unbiased for every N.
 
     Args:
       returns: G_t, `[T, N]` with N of at least 2.
       weight: as in `batch_mean`.
 
     Raises:
-      ValueError: a single trajectory, which has no others, or a shape that does not fit.
+      ValueError: there is only one trajectory, or a shape does not fit.
 
     Source: Kool et al., Buy 4 REINFORCE samples, get a baseline for free! (2019).
 
@@ -103,17 +103,17 @@ def leave_one_out(returns: jax.Array, weight: jax.Array | float = 1.0) -> jax.Ar
 
 
 def optimal(returns: jax.Array, squared_score: jax.Array, weight: jax.Array | float = 1.0) -> jax.Array:
-    """The number at each step that makes the gradient's term of that step vary least.
+    """The baseline of least variance among those that depend on the step alone.
 
         b_t = sum_i w_{t,i} |score_{t,i}|^2 G_{t,i} / sum_i w_{t,i} |score_{t,i}|^2
 
-    It minimises E|score_t (G_t - b_t)|^2 over the b_t that depend on t alone; the sample itself is in the mean, which
-    biases the gradient by a share of the order of 1/N.
+    It minimises E|score_t (G_t - b_t)|^2 over the b_t that depend on t alone. The mean includes the sample itself,
+    which gives a relative bias of the order of 1/N.
 
     Args:
       returns: G_t, `[T, ...]`.
-      squared_score: |grad log pi(a_t | s_t)|^2, `[T, ...]`; of the whole gradient or of the part to be quietened.
-      weight: as in `batch_mean`; at a step that counts for nobody b_t is 0.
+      squared_score: |grad log pi(a_t | s_t)|^2, `[T, ...]`; for all parameters, or for those whose variance to reduce.
+      weight: as in `batch_mean`; b_t is 0 at a step with no weight.
 
     Raises:
       ValueError: a shape does not fit.
@@ -124,9 +124,9 @@ def optimal(returns: jax.Array, squared_score: jax.Array, weight: jax.Array | fl
     [[1.5, 1.5]]
     """
     weight = broadcast_scalar(weight, returns, "weight") * check_shape(squared_score, returns, "squared_score")
-    across = tuple(range(1, returns.ndim))
-    total = jnp.sum(weight, axis=across, keepdims=True)
-    return jnp.broadcast_to(_ratio(jnp.sum(weight * returns, axis=across, keepdims=True), total), returns.shape)
+    axes = tuple(range(1, returns.ndim))
+    total = jnp.sum(weight, axis=axes, keepdims=True)
+    return jnp.broadcast_to(_ratio(jnp.sum(weight * returns, axis=axes, keepdims=True), total), returns.shape)
 
 
 def critic(returns: jax.Array, weight: jax.Array, value: jax.Array, squared_score: jax.Array) -> jax.Array:
@@ -135,7 +135,7 @@ def critic(returns: jax.Array, weight: jax.Array, value: jax.Array, squared_scor
 
 
 def zero(returns: jax.Array, weight: jax.Array, value: jax.Array, squared_score: jax.Array) -> float:
-    """b_t = 0: the returns as they are."""
+    """b_t = 0: no baseline."""
     return 0.0
 
 
@@ -150,5 +150,5 @@ def of_scores(function: Callable[[jax.Array, jax.Array, jax.Array], jax.Array]) 
 
 
 def _ratio(total: jax.Array, count: jax.Array) -> jax.Array:
-    """total / count, 0 where both are 0."""
+    """total / count, or 0 if both are 0."""
     return total / jnp.where(count == 0, 1, count)

@@ -1,4 +1,4 @@
-"""A rollout as the losses see it: advantages, targets, and what they are computed from."""
+"""Prepares a rollout for the losses: normalized observations, advantages, targets and weights."""
 
 from __future__ import annotations
 
@@ -16,13 +16,13 @@ from jaxpg.types import PyTree, Transition
 
 
 class Batch(NamedTuple):
-    """A rollout, `[T, N, ...]`, as constants: nothing in it depends on the parameters that are updated.
+    """A rollout, `[T, N, ...]`, as constants that do not depend on the parameters being updated.
 
     Attributes:
-      obs: normalized.
-      u: what the policy's Gaussian drew.
-      mean, log_std, log_prob: of the policy that acted.
-      value: V(s_t) of the critic at that time.
+      obs: normalized observations.
+      u: samples of the policy's Gaussian.
+      mean, log_std, log_prob: mean, log sigma and log pi(a_t | s_t) of the policy that acted.
+      value: V(s_t) of the critic before the update.
       advantage, target, weight: as in `Estimate` and `Method`.
     """
 
@@ -37,7 +37,7 @@ class Batch(NamedTuple):
     weight: jax.Array
 
 
-def batch_fn(
+def make_batch_fn(
     networks: Networks,
     method: Method,
     episode_length: int,
@@ -45,10 +45,10 @@ def batch_fn(
     normalize_advantages: bool,
     axis_name: str | None = None,
 ) -> Callable[[PyTree, PyTree, Transition], Batch]:
-    """`prepare(params, normalizer, transition, counts) -> Batch`: a rollout's advantages, and what they are made of.
+    """`prepare(params, normalizer, transition, counts) -> Batch`: the batch of a rollout.
 
-    Steps that do not count, `[T, N]` of bool, have the weight 0; their numbers are replaced before anything is computed
-    with them, so that none of it can overflow.
+    Steps that do not count (`counts`, `[T, N]` of bool) have weight 0; their numbers are replaced before anything is
+    computed from them, so that nothing overflows.
 
     Args:
       networks, method, reward_scale, normalize_advantages, axis_name: as in `on_policy`.
@@ -64,7 +64,7 @@ def batch_fn(
         def value_fn(x):
             return networks.value(params["critic"], normalization.normalize(normalizer, x))
 
-        next_value = next_values(value_fn, value, transition, episode_length)
+        next_value = compute_next_values(value_fn, value, transition, episode_length)
         weight = jnp.where(counts, method.weight(transition), 0.0)
         scaled = transition._replace(reward=reward_scale * transition.reward)
         mean, log_std = networks.policy(params["actor"], obs)
@@ -80,52 +80,55 @@ def batch_fn(
     return prepare
 
 
-def usable_steps(transition: Transition, statistics: normalization.RunningStatistics) -> jax.Array:
-    """Which steps can be learned from, `[T, N]` of bool: those whose episode stays sound to its end or the rollout's.
+def find_usable_steps(transition: Transition, statistics: normalization.RunningStatistics) -> jax.Array:
+    """The steps to learn from, `[T, N]` of bool: those from which the episode stays sound to its end or the rollout's.
 
-    An episode does not where its physics diverges, or where it is about to: an observation is further than
-    `jaxpg.divergence.FAR` deviations from the mean, or the policy drew a number that is not finite. All of its steps
-    before that are left out too: a joint that explodes passes through any size on its way.
+    An episode is not sound if its physics diverges or is about to: if an observation is more than
+    `jaxpg.divergence.MAX_DEVIATION` standard deviations from the mean, or a sample of the policy is not finite. Its
+    earlier steps are ignored too, since an exploding joint passes through every size on its way.
 
     Args:
-      transition: of a rollout.
-      statistics: of the observations, this rollout's sound ones included.
+      transition: the rollout.
+      statistics: statistics of the observations, including the sound ones of this rollout.
     """
-    at_home = [normalization.near(statistics, x, divergence.FAR) for x in (transition.obs, transition.next_obs)]
-    drawn = jnp.all(jnp.isfinite(transition.u), axis=-1)
-    bad = (transition.diverged > 0) | ~at_home[0] | ~at_home[1] | ~drawn
-    return divergence.lasting(bad, transition.ended)
+    bound = divergence.MAX_DEVIATION
+    is_near, is_next_near = (normalization.near(statistics, x, bound) for x in (transition.obs, transition.next_obs))
+    is_finite = jnp.all(jnp.isfinite(transition.u), axis=-1)
+    bad = (transition.diverged > 0) | ~is_near | ~is_next_near | ~is_finite
+    return divergence.find_sound_steps(bad, transition.ended)
 
 
 def neutralize(transition: Transition, counts: jax.Array, statistics: normalization.RunningStatistics) -> Transition:
-    """The rollout with steps that do not count replaced: mean observations, drawn and earned 0."""
+    """Replaces the steps that do not count: observations by their mean, samples and rewards by 0."""
     mean = jnp.broadcast_to(statistics.mean, transition.obs.shape)
-    replaced = {
+    replacements = {
         "obs": mean,
         "next_obs": mean,
         "u": jnp.zeros_like(transition.u),
         "reward": jnp.zeros_like(transition.reward),
     }
-    return transition._replace(**{name: select(counts, getattr(transition, name), x) for name, x in replaced.items()})
+    return transition._replace(
+        **{name: select(counts, getattr(transition, name), x) for name, x in replacements.items()}
+    )
 
 
-def next_values(
+def compute_next_values(
     value_fn: Callable[[jax.Array], jax.Array], value: jax.Array, transition: Transition, episode_length: int
 ) -> jax.Array:
     """V(s_{t+1}) of the true next observations, `[T, N]`; any number where the episode terminated.
 
-    Where an episode goes on it is the value of the next row. A time limit is reached at most once in T <=
-    episode_length steps: of each environment two more values are needed, at its time limit and after the last step.
+    Within an episode this is the value in the next row. A time limit is reached at most once in T <= episode_length
+    steps, so only two more values per environment are needed: at its time limit and after the last step.
 
     Args:
       value_fn: `value_fn(obs) -> V`.
       value: V(s_t), `[T, N]`.
-      transition: of the rollout.
-      episode_length: the time limit; the values of all next observations are computed where the rollout is longer.
+      transition: the rollout.
+      episode_length: the time limit; for a longer rollout, the values of all next observations are computed.
     """
     if len(value) > episode_length:
         return value_fn(transition.next_obs)
     when = jnp.argmax(transition.truncated, axis=0)
     at_limit = jnp.take_along_axis(transition.next_obs, when[None, :, None], axis=0)[0]
-    of_limit, of_last = value_fn(jnp.stack([at_limit, transition.next_obs[-1]]))
-    return jnp.where(transition.truncated > 0, of_limit, jnp.concatenate([value[1:], of_last[None]]))
+    limit_value, last_value = value_fn(jnp.stack([at_limit, transition.next_obs[-1]]))
+    return jnp.where(transition.truncated > 0, limit_value, jnp.concatenate([value[1:], last_value[None]]))

@@ -1,6 +1,6 @@
-"""What the parts of a mapped axis tell each other; with no axis there is one part, and nothing to tell.
+"""Collective operations over a mapped axis; without an axis they return their argument.
 
-The axis is that of `jax.shard_map` or `jax.vmap(..., axis_name=...)`. Parts are of equal size.
+The axis is that of `jax.shard_map` or `jax.vmap(..., axis_name=...)`. All its parts have the same size.
 """
 
 from __future__ import annotations
@@ -13,11 +13,11 @@ from jaxpg.types import PyTree
 
 
 def mean(tree: PyTree, axis_name: str | None) -> PyTree:
-    """The mean over all parts, leaf by leaf, as a single message: many small ones cost more than what they carry."""
+    """The mean of each leaf over all parts; all leaves travel in one message, as many small ones are slow."""
     if axis_name is None:
         return tree
-    numbers, tree_of = ravel_pytree(tree)
-    return tree_of(jax.lax.pmean(numbers, axis_name))
+    vector, unravel = ravel_pytree(tree)
+    return unravel(jax.lax.pmean(vector, axis_name))
 
 
 def total(x: jax.Array, axis_name: str | None) -> jax.Array:
@@ -25,24 +25,24 @@ def total(x: jax.Array, axis_name: str | None) -> jax.Array:
     return x if axis_name is None else jax.lax.psum(x, axis_name)
 
 
-def largest(x: jax.Array, axis_name: str | None) -> jax.Array:
+def maximum(x: jax.Array, axis_name: str | None) -> jax.Array:
     """The maximum over all parts."""
     return x if axis_name is None else jax.lax.pmax(x, axis_name)
 
 
-def first_place(where: jax.Array, axis_name: str | None) -> jax.Array:
-    """The first index at which a part of `where`, `[N]` of bool, is true, counted through all parts; -1 if none is.
+def find_first(where: jax.Array, axis_name: str | None) -> jax.Array:
+    """The first index at which `where`, `[N]` of bool, is true, counted over all parts; -1 if there is none.
 
-    >>> first_place(jnp.array([False, True, True]), None).item(), first_place(jnp.array([False]), None).item()
+    >>> find_first(jnp.array([False, True, True]), None).item(), find_first(jnp.array([False]), None).item()
     (1, -1)
     """
-    before = 0 if axis_name is None else len(where) * jax.lax.axis_index(axis_name)
-    after_all = jnp.iinfo(jnp.int32).max
-    place = jnp.where(jnp.any(where), before + jnp.argmax(where), after_all).astype(jnp.int32)
-    place = -largest(-place, axis_name)
-    return jnp.where(place == after_all, -1, place)
+    offset = 0 if axis_name is None else len(where) * jax.lax.axis_index(axis_name)
+    none = jnp.iinfo(jnp.int32).max
+    index = jnp.where(jnp.any(where), offset + jnp.argmax(where), none).astype(jnp.int32)
+    index = -maximum(-index, axis_name)
+    return jnp.where(index == none, -1, index)
 
 
 def fold_in_index(key: jax.Array, axis_name: str | None) -> jax.Array:
-    """A random key of this part's own, from one that all parts have."""
+    """A different random key for each part, from a key that all share."""
     return key if axis_name is None else jax.random.fold_in(key, jax.lax.axis_index(axis_name))

@@ -1,8 +1,8 @@
 """Diagonal Gaussian policies, plain and squashed by tanh into an actuator's limits.
 
-The pre-squashing action u ~ N(mean, sigma^2) is what is sampled, stored and scored; the actuator gets
+The action before squashing, u ~ N(mean, sigma^2), is sampled, stored and scored; the actuator gets
 a = limit * tanh(u). Working with u avoids atanh, which is infinite for |u| > 9 in float32. Arrays are
-`[..., action_size]`; log-probabilities and entropies are summed over the last axis and come as `[...]`.
+`[..., action_size]`; log-probabilities and entropies are summed over the last axis, `[...]`.
 """
 
 from __future__ import annotations
@@ -58,7 +58,7 @@ def gaussian_entropy(log_std: jax.Array) -> jax.Array:
       log_std: log sigma, `[..., action_size]`.
 
     Returns:
-      `[...]` in nats. The squashed policy's entropy is another, E[log |da/du|] more, without a closed form.
+      `[...]` in nats. The squashed policy's entropy is this plus E[log |da/du|], which has no closed form.
 
     >>> round(float(gaussian_entropy(jnp.zeros(1))), 5)
     1.41894
@@ -67,12 +67,12 @@ def gaussian_entropy(log_std: jax.Array) -> jax.Array:
 
 
 def gaussian_kl(old_mean: jax.Array, old_log_std: jax.Array, mean: jax.Array, log_std: jax.Array) -> jax.Array:
-    """Kullback-Leibler divergence of one Gaussian with independent components from another.
+    """Kullback-Leibler divergence between diagonal Gaussians.
 
         KL(old || new) = sum_i [ log(sigma_i / sigma'_i) + (sigma'_i^2 + (mu'_i - mu_i)^2) / (2 sigma_i^2) - 1/2 ]
 
-    with mu', sigma' the old ones. It is that of the squashed policies too: an invertible map changes both densities by
-    the same factor.
+    with mu', sigma' of the old policy. The squashed policies have the same divergence, since an invertible map changes
+    both densities by the same factor.
 
     Args:
       old_mean, mean: `[..., action_size]`.
@@ -91,7 +91,7 @@ def gaussian_kl(old_mean: jax.Array, old_log_std: jax.Array, mean: jax.Array, lo
 
 
 def squash(u: jax.Array, limit: jax.Array | float = 1.0) -> jax.Array:
-    """a = limit * tanh(u): any u into an actuator's limits.
+    """a = limit * tanh(u): maps any u into an actuator's limits.
 
     Source: the lesson, section 5.1.
 
@@ -106,7 +106,7 @@ def squash_log_det(u: jax.Array, limit: jax.Array | float = 1.0) -> jax.Array:
 
         sum_i log(limit_i (1 - tanh(u_i)^2)) = sum_i [ log limit_i + 2 (log 2 - u_i - softplus(-2 u_i)) ]
 
-    The right-hand form is exact where 1 - tanh^2 has underflowed; it is finite for every finite u.
+    The right-hand form stays exact where 1 - tanh^2 underflows, and is finite for every finite u.
 
     Args:
       u: `[..., action_size]`.
@@ -128,8 +128,8 @@ def squashed_gaussian_log_prob(
 
         log pi(a) = log N(u; mean, sigma) - sum_i log |da_i / du_i|
 
-    The Jacobian does not depend on the policy's parameters: for a stored u the *score* is the Gaussian's. It does
-    matter for densities, entropies, and wherever u itself is differentiated.
+    The Jacobian does not depend on the policy's parameters, so for a stored u the *score* is the Gaussian's. The
+    Jacobian does matter for densities, entropies, and wherever u itself is differentiated.
 
     Args:
       u: the action before squashing, `[..., action_size]`.
@@ -151,12 +151,12 @@ def squashed_gaussian_log_prob(
 def squashed_gaussian_entropy(
     u: jax.Array, mean: jax.Array, log_std: jax.Array, limit: jax.Array | float = 1.0
 ) -> jax.Array:
-    """Differential entropy of a = limit tanh(u) for u ~ N(mean, sigma^2), estimated from the one sample u.
+    """Differential entropy of a = limit tanh(u) for u ~ N(mean, sigma^2), estimated from one sample u.
 
-        H(a) = H(u) + E[sum_i log |da_i / du_i|],    the mean of    H(u) + sum_i log |da_i / du_i|
+        H(a) = H(u) + E[sum_i log |da_i / du_i|],    estimated by    H(u) + sum_i log |da_i / du_i|
 
-    There is no closed form. The estimate is unbiased, and so is its gradient: the sample is written as u = mean +
-    sigma epsilon, with epsilon held. Unlike the Gaussian's own entropy it falls when sigma grows beyond about 1, where
+    There is no closed form. The estimate is unbiased, and so is its gradient: u = mean + sigma epsilon is
+    differentiated at fixed epsilon. Unlike the Gaussian's entropy, this one falls as sigma grows beyond about 1, where
     tanh drives the actions into both limits.
 
     Args:
@@ -172,17 +172,17 @@ def squashed_gaussian_entropy(
     1.41894
     """
     epsilon = jax.lax.stop_gradient((u - mean) * jnp.exp(-log_std))
-    moved = mean + jnp.exp(log_std) * epsilon
-    return gaussian_entropy(jnp.broadcast_to(log_std, mean.shape)) + squash_log_det(moved, limit)
+    sample = mean + jnp.exp(log_std) * epsilon
+    return gaussian_entropy(jnp.broadcast_to(log_std, mean.shape)) + squash_log_det(sample, limit)
 
 
 class Distribution(NamedTuple):
-    """How actions are made of u ~ N(mean, sigma^2), and what that makes of densities.
+    """The distribution of the actions made from u ~ N(mean, sigma^2).
 
     Attributes:
-      action: `action(u)`, what the environment takes.
-      log_prob: `log_prob(u, mean, log_std) -> log pi(a | s)`, `[...]`, of the action made of u.
-      entropy: `entropy(u, mean, log_std)`, `[...]`, of the action, exact or estimated from the sample u.
+      action: `action(u)`, the action for the environment.
+      log_prob: `log_prob(u, mean, log_std) -> log pi(a | s)`, `[...]`, of the action made from u.
+      entropy: `entropy(u, mean, log_std)`, `[...]`, of the action; exact, or estimated from the sample u.
     """
 
     action: Callable[[jax.Array], jax.Array]
@@ -190,7 +190,7 @@ class Distribution(NamedTuple):
     entropy: Callable[[jax.Array, jax.Array, jax.Array], jax.Array]
 
 
-# Actions within [-1, 1], and actions as they come, for environments without limits.
+# Actions within [-1, 1], and unlimited actions, for environments without limits.
 SQUASHED_GAUSSIAN = Distribution(squash, squashed_gaussian_log_prob, squashed_gaussian_entropy)
 GAUSSIAN = Distribution(
     lambda u: u,

@@ -1,5 +1,5 @@
-"""The user's mistakes."""
+"""Errors that are the user's mistakes."""
 
 
 class UserError(Exception):
-    """Something that the user can put right; its text says what is wrong and what would be right."""
+    """A mistake that the user can fix; the message says what is wrong and what would be right."""

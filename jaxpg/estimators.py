@@ -1,6 +1,6 @@
 """The ladder of policy-gradient estimators, side by side.
 
-All estimate the same gradient, by the same sum with a different advantage:
+All estimate the same gradient by the same sum, with different advantages:
 
     grad J(theta) ~ mean over trajectories of  sum_t  grad log pi_theta(a_t | s_t)  A_t
 
@@ -12,11 +12,11 @@ All estimate the same gradient, by the same sum with a different advantage:
 | `td_lambda` (GAE) | G_t^lambda - V(s_t)              | between             | grows with lambda           |
 | `td_zero`         | r_t + gamma V(s_{t+1}) - V(s_t)  | the critic's        | lowest                      |
 
-`jaxpg.baselines` has the baselines b_t with their own table. REINFORCE needs complete episodes, the others bootstrap
-from the critic where a trajectory is cut. The critic of REINFORCE learns G_t, that of the others A_t + V(s_t).
+`jaxpg.baselines` has a table of the baselines b_t. REINFORCE needs complete episodes; the others bootstrap from the
+critic where a trajectory is cut. The target of the critic is G_t for REINFORCE and A_t + V(s_t) for the others.
 
-Bias is with respect to the gradient that leaves out the factor gamma^t, as the lesson's section 3 does; times
-`jaxpg.returns.discount_factors` all of them estimate grad J itself. `reinforce_whole` does so as it is.
+Bias is relative to the gradient without the factor gamma^t, as in the lesson's section 3. With the advantages
+multiplied by `jaxpg.returns.discount_factors`, all estimate grad J itself. `reinforce_whole` does so as it is.
 """
 
 from __future__ import annotations
@@ -29,15 +29,15 @@ import jax.numpy as jnp
 
 from jaxpg import collectives
 from jaxpg.returns import discounted_returns, lambda_returns, n_step_returns, td_errors
-from jaxpg.shapes import broadcast_scalar, check_shape, floating
+from jaxpg.shapes import broadcast_scalar, check_shape, to_floating
 
 
 class Estimate(NamedTuple):
-    """What one estimator makes of a trajectory.
+    """The result of an estimator for a trajectory.
 
     Attributes:
       advantage: A_t, the factor of the score grad log pi(a_t | s_t), `[T, ...]`.
-      target: what the critic's V(s_t) is regressed to, `[T, ...]`.
+      target: regression target of the critic's V(s_t), `[T, ...]`.
     """
 
     advantage: jax.Array
@@ -45,16 +45,16 @@ class Estimate(NamedTuple):
 
 
 def reinforce(reward: jax.Array, discount: jax.Array | float, baseline: jax.Array | float = 0.0) -> Estimate:
-    """REINFORCE: the return, from complete episodes, less a baseline.
+    """REINFORCE: the return minus a baseline, from complete episodes.
 
         A_t = G_t - b_t,    G_t = r_t + d_t G_{t+1},    G_T = 0
 
-    With b_t = V(s_t) it is Monte Carlo minus value.
+    With b_t = V(s_t) this is Monte Carlo minus value.
 
     Args:
       reward: r_t, `[T, ...]`, 0 after the end of an episode.
       discount: d_t, `[T, ...]` or a scalar.
-      baseline: b_t, `[T, ...]` or a scalar; it may depend on s_t, not on a_t (`jaxpg.baselines`).
+      baseline: b_t, `[T, ...]` or a scalar; may depend on s_t but not on a_t (`jaxpg.baselines`).
 
     Raises:
       ValueError: an array's shape does not fit the rewards'.
@@ -69,12 +69,12 @@ def reinforce(reward: jax.Array, discount: jax.Array | float, baseline: jax.Arra
 
 
 def reinforce_whole(reward: jax.Array, discount: jax.Array | float, baseline: jax.Array | float = 0.0) -> Estimate:
-    """REINFORCE with the return of the whole trajectory, as the theorem is first derived.
+    """REINFORCE with the return of the whole trajectory, as in the first form of the theorem.
 
         A_t = R(tau) - b,    R(tau) = sum_k d_0 ... d_{k-1} r_k = G_0
 
-    It estimates exactly the gradient of J, factor gamma^t included: each score is multiplied by rewards that came
-    before it too, which changes no mean and adds variance. The critic's target is the return to go.
+    This estimates the gradient of J exactly, factor gamma^t included. Each score is also multiplied by the rewards
+    before it, which adds variance but does not change the mean. The critic's target is the return to go.
 
     Args:
       reward: r_t, `[T, ...]`, 0 after the end of an episode.
@@ -126,7 +126,7 @@ def n_step(
     n: int,
     continues: jax.Array | float = 1.0,
 ) -> Estimate:
-    """n rewards, then the critic: between TD(0), n = 1, and Monte Carlo minus value, n >= T.
+    """n rewards, then the critic: from TD(0), n = 1, to Monte Carlo minus value, n >= T.
 
         A_t = G^(n)_t - V(s_t)
 
@@ -135,7 +135,7 @@ def n_step(
       discount: d_t, `[T, ...]` or a scalar; 0 where s_{t+1} is terminal.
       value: V(s_t), `[T, ...]`.
       next_value: V of the true s_{t+1}, `[T, ...]`.
-      n: how many rewards to sum, at least 1.
+      n: number of rewards to sum, at least 1.
       continues: 0 at a cut, else 1, `[T, ...]` or a scalar.
 
     Raises:
@@ -161,8 +161,8 @@ def td_lambda(
 
         A_t = G_t^lambda - V(s_t) = delta_t + d_t lambda_t A_{t+1}
 
-    lambda = 0 is `td_zero`; lambda = 1 is Monte Carlo minus value, with a bootstrap at cuts. The second form holds
-    where lambda_t > 0 only with V(s_{t+1}) = value[t+1], that is, with `next_value` of the same critic.
+    lambda = 0 is `td_zero`; lambda = 1 is Monte Carlo minus value, with a bootstrap at cuts. The second form
+    holds only if V(s_{t+1}) = value[t+1] wherever lambda_t > 0, that is, if `next_value` is from the same critic.
 
     Args:
       reward: r_t, `[T, ...]`.
@@ -183,12 +183,12 @@ def td_lambda(
     return Estimate(returns - check_shape(value, returns, "value"), returns)
 
 
-# estimate(reward, discount, value, next_value, continues) -> Estimate, of steps that may be cut
+# estimate(reward, discount, value, next_value, continues) -> Estimate; trajectories may be cut
 Estimator = Callable[[jax.Array, jax.Array, jax.Array, jax.Array, jax.Array], Estimate]
 
 
 def gae(lambda_: jax.Array | float) -> Estimator:
-    """`td_lambda` of steps that may be cut: lambda_t = lambda continues_t.
+    """`td_lambda` for trajectories that may be cut: lambda_t = lambda continues_t.
 
     lambda 0 is the one-step TD error; lambda 1 is Monte Carlo minus value, with a bootstrap at cuts.
     """
@@ -200,7 +200,7 @@ def gae(lambda_: jax.Array | float) -> Estimator:
 
 
 def n_rewards(n: int) -> Estimator:
-    """`n_step` of steps that may be cut, with n rewards and then the critic."""
+    """`n_step` for trajectories that may be cut: n rewards, then the critic."""
 
     def estimate(reward, discount, value, next_value, continues):
         return n_step(reward, discount, value, next_value, n, continues)
@@ -215,30 +215,30 @@ def normalize_advantages(
 
         A'_t = (A_t - mean A) / sqrt(var A + (epsilon max |A|)^2),    with weighted mean and variance
 
-    A batch of a single step that counts stays as it is: less its mean it would be 0, whatever was earned.
+    If only one step counts, the batch is returned unchanged: minus its mean it would be 0, whatever the return.
 
     Args:
       advantage: A_t, `[T, ...]`.
-      weight: 1 where the step counts, else 0, `[T, ...]` or a scalar. Entries of weight 0 are shifted too, and
-        must be masked again by the loss.
-      epsilon: keeps a batch of equal entries, whose mean is right to rounding only, near 0.
-      axis_name: a mapped axis, along which there are further parts of the batch.
+      weight: 1 if the step counts, else 0, `[T, ...]` or a scalar. Entries of weight 0 are shifted too, so the
+        loss must mask them again.
+      epsilon: keeps a batch of equal entries near 0, as their mean is subject to rounding.
+      axis_name: mapped axis over which the batch is divided.
 
     Raises:
       ValueError: the weight's shape does not fit.
 
-    Source: practice; not part of the theorem. It rescales the step, and like every mean over the batch it
-    includes the sample itself.
+    Source: practice; not part of the theorem. It rescales the step, and its mean includes the sample itself, like every
+    mean over the batch.
 
     >>> normalize_advantages(jnp.array([1.0, 3.0])).round(3).tolist()
     [-1.0, 1.0]
     """
-    advantage = floating(advantage)
+    advantage = to_floating(advantage)
     weight = broadcast_scalar(weight, advantage, "weight")
     total = collectives.total(jnp.sum(weight), axis_name)
-    total = jnp.where(total == 0, 1.0, total)  # nothing counts
+    total = jnp.where(total == 0, 1.0, total)  # no step counts
     centred = advantage - collectives.total(jnp.sum(weight * advantage), axis_name) / total
-    largest = collectives.largest(jnp.max(jnp.abs(weight * advantage)), axis_name)
+    largest = collectives.maximum(jnp.max(jnp.abs(weight * advantage)), axis_name)
     variance = collectives.total(jnp.sum(weight * centred**2), axis_name) / total + (epsilon * largest) ** 2
     normalized = centred / jnp.sqrt(jnp.maximum(variance, jnp.finfo(advantage.dtype).tiny))
     return jnp.where(total > 1, normalized, advantage)

@@ -1,4 +1,4 @@
-"""How good a deterministic policy is: complete episodes from fixed starts, in one scan for all who play them."""
+"""Evaluates a deterministic policy: complete episodes from fixed starts, as one scan."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
-from jaxpg.divergence import diverged
+from jaxpg.divergence import has_diverged
 from jaxpg.shapes import select
 from jaxpg.types import Metrics
 
@@ -17,10 +17,10 @@ class Episodes(NamedTuple):
     """N complete episodes.
 
     Attributes:
-      episode_return: undiscounted, `[N]`.
+      episode_return: undiscounted return, `[N]`; up to the divergence if the physics diverged.
       length: steps until termination, divergence or the time limit, `[N]`.
-      metrics: the environment's metrics, the last of each episode that were finite, `[N]` by name.
-      diverged: whether the physics did (`jaxpg.divergence`), `[N]` of bool; what was earned before it is the return.
+      metrics: the environment's metrics, the last finite ones of each episode, `[N]` by name.
+      diverged: whether the physics diverged (`jaxpg.divergence`), `[N]` of bool.
     """
 
     episode_return: jax.Array
@@ -33,11 +33,11 @@ class Step(NamedTuple):
     """One step of N episodes; after an episode's end its state stays as it is.
 
     Attributes:
-      before, after: brax's States; `after` is `before` where the physics diverged.
+      before, after: brax's States; `after` is `before` if the physics diverged.
       action: `[N, m]`.
-      reward: `[N]`; 0 where the physics diverged, and after the end.
-      metrics: those of `Episodes`, so far.
-      alive: whether the step is one of the episode, `[N]` of bool.
+      reward: `[N]`; 0 if the physics diverged, and after the end.
+      metrics: as in `Episodes`, up to this step.
+      alive: whether the step belongs to the episode, `[N]` of bool.
     """
 
     before: Any
@@ -49,18 +49,18 @@ class Step(NamedTuple):
 
 
 def evaluate(env: Any, policy: Callable[[jax.Array], jax.Array], keys: jax.Array, episode_length: int) -> Episodes:
-    """Plays an episode from each of N starts, once, to its end.
+    """Plays one complete episode from each of N starts.
 
         R_i = sum_{t < T_i} r_{i,t},    a_t = policy(s_t)
 
     Args:
-      env: brax-shaped environment.
+      env: environment with brax's interface.
       policy: `policy(obs[N, ...]) -> action[N, m]` in [-1, 1].
-      keys: fix the starts, `[N]`: the same key gives the same one.
+      keys: random keys, `[N]`; the same key gives the same start.
       episode_length: the time limit.
 
     Returns:
-      `Episodes`; steps after a termination count for nothing, whatever their numbers are.
+      `Episodes`; numbers after a termination are ignored, whatever they are.
     """
     return play(env, policy, keys, episode_length, lambda step: None)[0]
 
@@ -72,41 +72,41 @@ def play(
     episode_length: int,
     look: Callable[[Step], Any],
 ) -> tuple[Episodes, Any]:
-    """`evaluate`, and what is seen of each step.
+    """`evaluate` that also records each step.
 
     Args:
-      env, policy, keys, episode_length: as there.
-      look: what is kept of a `Step`, a tree of arrays `[N, ...]`.
+      env, policy, keys, episode_length: as in `evaluate`.
+      look: `look(step)`, what to record of a `Step`: a tree of arrays `[N, ...]`.
 
     Returns:
-      The episodes, and what was seen, leaves `[T, N, ...]`.
+      The episodes, and the records, with leaves `[T, N, ...]`.
     """
 
     def step(carry, _):
         state, alive, episodes = carry
         action = policy(state.obs)
         after = jax.vmap(env.step)(state, action)
-        exploded = alive & jax.vmap(diverged)(state, after)
-        counted = alive & ~exploded
-        after = select(counted, after, state)
-        reward = jnp.where(counted, after.reward, 0.0)
+        diverged = alive & jax.vmap(has_diverged)(state, after)
+        counts = alive & ~diverged
+        after = select(counts, after, state)
+        reward = jnp.where(counts, after.reward, 0.0)
         episodes = Episodes(
             episode_return=episodes.episode_return + reward,
             length=episodes.length + alive,
-            metrics={name: _newest(after.metrics[name], last) for name, last in episodes.metrics.items()},
-            diverged=episodes.diverged | exploded,
+            metrics={name: _choose_finite(after.metrics[name], last) for name, last in episodes.metrics.items()},
+            diverged=episodes.diverged | diverged,
         )
-        seen = look(Step(state, after, action, reward, episodes.metrics, alive))
-        return (after, counted & (after.done == 0), episodes), seen
+        record = look(Step(state, after, action, reward, episodes.metrics, alive))
+        return (after, counts & (after.done == 0), episodes), record
 
     state = jax.vmap(env.reset)(keys)
-    nothing = jnp.zeros_like(state.reward)
-    alive = nothing == 0
-    episodes = Episodes(nothing, nothing.astype(jnp.int32), state.metrics, ~alive)
-    (_, _, episodes), seen = jax.lax.scan(step, (state, alive, episodes), length=episode_length)
-    return episodes, seen
+    zeros = jnp.zeros_like(state.reward)
+    alive = zeros == 0
+    episodes = Episodes(zeros, zeros.astype(jnp.int32), state.metrics, ~alive)
+    (_, _, episodes), records = jax.lax.scan(step, (state, alive, episodes), length=episode_length)
+    return episodes, records
 
 
-def _newest(value: jax.Array, last: jax.Array) -> jax.Array:
-    """The value where it is finite, and else the last that was."""
+def _choose_finite(value: jax.Array, last: jax.Array) -> jax.Array:
+    """The value if it is finite, else the last one."""
     return jnp.where(jnp.isfinite(value), value, last)

@@ -1,7 +1,7 @@
 """Fixed features of observations, for policies and values that are linear in them.
 
-Functions of arrays `[..., n]`, made for observations of mean 0 and deviation 1 as the normalizer gives them; a constant
-feature is left to the bias of the layer above, where it would be there twice.
+The functions take arrays `[..., n]` of observations with mean 0 and standard deviation 1, as the normalizer returns
+them. There is no constant feature, as the layer above has a bias.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ import math
 import jax
 import jax.numpy as jnp
 
-BOUND = 3.0  # Fourier and radial features live on [-3, 3]^n: 99.7 % of a normalized Gaussian, an axis at a time
+BOUND = 3.0  # Fourier and radial features cover [-3, 3]^n: 99.7 % of a normalized Gaussian on each axis
 
 
 def identity(x: jax.Array, order: int = 1) -> jax.Array:
@@ -44,7 +44,7 @@ def polynomial(x: jax.Array, order: int) -> jax.Array:
 
 
 def monomials(size: int, order: int) -> list[tuple[int, ...]]:
-    """The factors of each of the `polynomial` features, by their places in the observation.
+    """The factors of each of the `polynomial` features, as indices into the observation.
 
     >>> monomials(2, 2)
     [(0,), (1,), (0, 0), (0, 1), (1, 1)]
@@ -54,13 +54,13 @@ def monomials(size: int, order: int) -> list[tuple[int, ...]]:
 
 
 def fourier(x: jax.Array, order: int) -> jax.Array:
-    """Cosines of all frequencies up to `order` in every direction.
+    """Cosines with all frequencies up to `order` along each axis.
 
         phi_c(x) = cos(pi c . z),    z = (clip(x, -3, 3) + 3) / 6 in [0, 1]^n,    c in {0, ..., order}^n, c != 0
 
     Args:
       x: `[..., n]`.
-      order: highest frequency of an axis, at least 1.
+      order: highest frequency on each axis, at least 1.
 
     Returns:
       `[..., (order + 1)^n - 1]`.
@@ -80,11 +80,11 @@ def radial(x: jax.Array, order: int) -> jax.Array:
 
         phi_j(x) proportional to exp(-|x - c_j|^2 / (2 h^2)),    c_j on the grid of `order` points per axis in [-3, 3]^n
 
-    with h the distance between neighbours. Outside the grid the nearest bumps decide.
+    with h the distance between neighbours. Outside the grid the nearest bumps dominate.
 
     Args:
       x: `[..., n]`.
-      order: grid points of an axis, at least 2.
+      order: grid points on each axis, at least 2.
 
     Returns:
       `[..., order^n]`.
@@ -96,9 +96,9 @@ def radial(x: jax.Array, order: int) -> jax.Array:
     """
     axis = jnp.linspace(-BOUND, BOUND, order, dtype=x.dtype)
     width = 2 * BOUND / (order - 1)
-    # |x - c|^2 is a sum over the axes, so the bumps are a product of each axis's own.
+    # |x - c|^2 is a sum over the axes, so each bump is a product of one-dimensional bumps.
     bumps = jnp.ones((*x.shape[:-1], 1), x.dtype)
     for i in range(x.shape[-1]):
-        own = jax.nn.softmax(-(((x[..., i : i + 1] - axis) / width) ** 2) / 2, axis=-1)
-        bumps = (bumps[..., :, None] * own[..., None, :]).reshape(*x.shape[:-1], -1)
+        axis_bumps = jax.nn.softmax(-(((x[..., i : i + 1] - axis) / width) ** 2) / 2, axis=-1)
+        bumps = (bumps[..., :, None] * axis_bumps[..., None, :]).reshape(*x.shape[:-1], -1)
     return bumps

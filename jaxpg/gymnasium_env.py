@@ -29,7 +29,7 @@ from gymnasium.vector.utils import batch_space
 import envs
 from envs.base import interface, with_fields
 from envs.options import OptionError, build
-from jaxpg.divergence import diverged
+from jaxpg.divergence import has_diverged
 from jaxpg.shapes import select
 
 MAX_SHARED = 8  # shared environments that are kept
@@ -177,10 +177,10 @@ def compile_functions(env: Any) -> EnvFunctions:
 def step_finite(env: Any, state: Any, action: jax.Array) -> Any:
     """One step; if the physics diverges, the episode terminates with the previous observation and reward 0.
 
-    As in training, `jaxpg.divergence.diverged` decides that.
+    As in training, `jaxpg.divergence.has_diverged` decides that.
     """
     after = env.step(state, action)
-    is_diverged = diverged(state, after)
+    is_diverged = has_diverged(state, after)
     return with_fields(
         after,
         obs=jnp.where(is_diverged, state.obs, after.obs),

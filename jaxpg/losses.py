@@ -1,8 +1,7 @@
 """Scalar losses of arrays, to be minimised.
 
-They take arrays, not parameters and not networks. The gradient is stopped where the theory takes a factor for a
-constant: advantages and targets are stopped here, unconditionally. A shape mismatch raises, since `[N]` against
-`[N, 1]` would be spread in silence to `[N, N]`.
+They take arrays, not parameters or networks. Advantages and targets are constants in the theory, so their gradient is
+always stopped here. A shape mismatch raises, since `[N]` and `[N, 1]` would silently broadcast to `[N, N]`.
 """
 
 from __future__ import annotations
@@ -21,8 +20,8 @@ def policy_gradient_loss(log_prob: jax.Array, advantage: jax.Array, weight: jax.
     Args:
       log_prob: log pi(a_t | s_t), `[T, ...]`, differentiable.
       advantage: A_t, `[T, ...]`; no gradient passes through it.
-      weight: w_t, 0 for steps that do not count, `[T, ...]` or a scalar. The mean is over all entries, counted or
-        not, so that a random number of counted ones does not bias it.
+      weight: w_t, 0 for steps that do not count, `[T, ...]` or a scalar. The mean is over all entries, so that it is
+        not biased when the number of counted ones is random.
 
     Raises:
       ValueError: the shapes differ.
@@ -43,19 +42,19 @@ def clipped_surrogate_loss(
     clip: float | None,
     weight: jax.Array | float = 1.0,
 ) -> jax.Array:
-    """Surrogate for several gradient steps on the actions of one policy: PPO's.
+    """PPO's surrogate, for several gradient steps on the actions of one policy.
 
         L     = -mean(w_t min(rho_t A_t, clip(rho_t, 1 - epsilon, 1 + epsilon) A_t))
         rho_t = pi(a_t | s_t) / pi_old(a_t | s_t)
 
-    Where pi is pi_old its gradient is that of `policy_gradient_loss`. A step whose ratio has left the interval in the
-    direction that its advantage asks for has no gradient any more.
+    At pi = pi_old its gradient equals that of `policy_gradient_loss`. A step has no gradient once its ratio has left
+    the interval in the direction that the advantage favours.
 
     Args:
       log_prob: log pi(a_t | s_t), `[T, ...]`, differentiable.
-      old_log_prob: that of the policy which acted, `[T, ...]`; no gradient passes through it.
+      old_log_prob: log pi_old(a_t | s_t), of the policy that acted, `[T, ...]`; no gradient passes through it.
       advantage: A_t, `[T, ...]`; no gradient passes through it.
-      clip: epsilon, positive; None leaves the ratio as it is.
+      clip: epsilon, positive; None does not clip.
       weight: as in `policy_gradient_loss`.
 
     Raises:
@@ -64,7 +63,7 @@ def clipped_surrogate_loss(
     Source: Schulman et al., arXiv 1707.06347, equation 7.
 
     >>> log_prob, advantage = jnp.log(jnp.array([1.5, 1.5])), jnp.array([1.0, -1.0])
-    >>> round(clipped_surrogate_loss(log_prob, jnp.zeros(2), advantage, clip=0.2).item(), 3)  # of -1.2 and 1.5
+    >>> round(clipped_surrogate_loss(log_prob, jnp.zeros(2), advantage, clip=0.2).item(), 3)  # mean of -1.2 and 1.5
     0.15
     """
     weight = broadcast_scalar(weight, log_prob, "weight")
@@ -103,13 +102,13 @@ def value_loss(value: jax.Array, target: jax.Array, weight: jax.Array | float = 
 def clipped_value_loss(
     value: jax.Array, old_value: jax.Array, target: jax.Array, clip: float, weight: jax.Array | float = 1.0
 ) -> jax.Array:
-    """`value_loss` of a critic that may move by `clip` only, or the plain one where that is larger.
+    """The larger of `value_loss` and the same loss with the value clipped to within `clip` of the old one.
 
         L = 1/2 mean(w_t max((V - G)^2, (V_old + clip(V - V_old, -c, c) - G)^2)),    G = stop(target_t)
 
     Args:
       value: V(s_t), `[T, ...]`, differentiable.
-      old_value: that of the critic before the first step on this rollout, `[T, ...]`; no gradient passes through it.
+      old_value: V_old(s_t), before the first gradient step on this rollout, `[T, ...]`; no gradient passes through it.
       target: `[T, ...]`; no gradient passes through it.
       clip: c, positive, in units of the (scaled) return.
       weight: as in `policy_gradient_loss`.
@@ -125,12 +124,12 @@ def clipped_value_loss(
     weight = broadcast_scalar(weight, value, "weight")
     target = jax.lax.stop_gradient(check_shape(target, value, "target"))
     old_value = jax.lax.stop_gradient(check_shape(old_value, value, "old_value"))
-    held = old_value + jnp.clip(value - old_value, -clip, clip)
-    return 0.5 * jnp.mean(weight * jnp.maximum((value - target) ** 2, (held - target) ** 2))
+    clipped_value = old_value + jnp.clip(value - old_value, -clip, clip)
+    return 0.5 * jnp.mean(weight * jnp.maximum((value - target) ** 2, (clipped_value - target) ** 2))
 
 
 def entropy_loss(entropy: jax.Array, weight: jax.Array | float = 1.0) -> jax.Array:
-    """Minus the mean entropy: added with a small factor, it keeps the policy exploring.
+    """Minus the mean entropy; added to the loss with a small factor, it keeps the policy exploring.
 
         L = -mean(w_t H_t)
 

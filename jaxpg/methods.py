@@ -1,4 +1,4 @@
-"""How steps are collected and what is made of them: all that REINFORCE and TD do differently."""
+"""REINFORCE and TD as methods: how they collect steps and estimate advantages, all in which they differ."""
 
 from __future__ import annotations
 
@@ -22,11 +22,11 @@ class Method(NamedTuple):
     """How an algorithm collects its steps and estimates advantages.
 
     Attributes:
-      start: `start(env, key) -> env_state`, the environments before the first update.
+      start: `start(env, key) -> env_state`, the state of the environments before the first update.
       collect: `collect(env, policy_fn, env_state, key) -> (env_state, Transition)`.
-      weight: `weight(transition) -> [T, N]`, 1 where a step counts.
+      weight: `weight(transition) -> [T, N]`, 1 if the step counts.
       estimate: `estimate(transition, weight, value, next_value, squared_score) -> Estimate`, all `[T, N]`; the score is
-        the gradient of log pi(a_t | s_t) in the Gaussian's mean.
+        the gradient of log pi(a_t | s_t) with respect to the Gaussian's mean.
     """
 
     start: Callable[[VectorEnv, jax.Array], VectorState]
@@ -36,15 +36,15 @@ class Method(NamedTuple):
 
 
 def td(gamma: float, num_steps: int, estimate: Estimator = estimators.gae(0.95)) -> Method:
-    """Temporal differences: short rollouts that go on where the last one stopped, and bootstrap.
+    """Temporal differences: short rollouts, each continuing where the last one stopped, with bootstrapping.
 
     Termination sets the discount to 0. A time limit or the end of the rollout stops the lambda-sum and bootstraps
     from the value of the true next observation.
 
     Args:
       gamma: discount, in [0, 1].
-      num_steps: T, length of a rollout.
-      estimate: `estimators.gae(lambda_)`, `estimators.n_rewards(n)`, or one's own function of the same arguments.
+      num_steps: T, the length of a rollout.
+      estimate: `estimators.gae(lambda_)`, `estimators.n_rewards(n)`, or another `Estimator`.
     """
 
     def start(env, key):
@@ -54,11 +54,11 @@ def td(gamma: float, num_steps: int, estimate: Estimator = estimators.gae(0.95))
     def collect(env, policy_fn, env_state, key):
         return rollout(policy_fn, env.step, env_state, key, num_steps)
 
-    def estimate_of(transition, weight, value, next_value, squared_score):
+    def estimate_rollout(transition, weight, value, next_value, squared_score):
         discount = gamma * (1 - transition.terminated)
         return estimate(transition.reward, discount, value, next_value, 1 - transition.truncated)
 
-    return Method(start, collect, lambda transition: jnp.ones_like(transition.reward), estimate_of)
+    return Method(start, collect, lambda transition: jnp.ones_like(transition.reward), estimate_rollout)
 
 
 def reinforce(
@@ -72,9 +72,8 @@ def reinforce(
     Args:
       gamma: discount, in [0, 1].
       baseline: one of `jaxpg.baselines`, such as `baselines.of_returns(baselines.leave_one_out)`.
-      returns: `estimators.reinforce` counts them from each step on, `estimators.reinforce_whole` for the episode.
-      discounted: advantages times gamma^t, which makes the estimate that of the gradient of J; with whole returns it is
-        so without.
+      returns: `estimators.reinforce` sums rewards from each step on, `estimators.reinforce_whole` over the episode.
+      discounted: multiply the advantages by gamma^t, to estimate the gradient of J; whole returns estimate it without.
     """
 
     def collect(env, policy_fn, env_state, key):
@@ -82,15 +81,15 @@ def reinforce(
         return rollout(policy_fn, env.step, env.reset(key_reset), key_rollout, env.episode_length)
 
     def weight(transition):
-        """1 up to and with the step that ends the episode, 0 in the one that the reset began."""
+        """1 up to and including the step that ends the episode, 0 after it."""
         ended = jnp.cumsum(transition.terminated, axis=0) - transition.terminated
         return (ended == 0).astype(transition.reward.dtype)
 
     def estimate(transition, weight, value, next_value, squared_score):
         reward = weight * transition.reward
         discount = gamma * (1 - transition.terminated)
-        earned, target = returns(reward, discount)
-        advantage = earned - baseline(earned, weight, value, squared_score)
+        gain, target = returns(reward, discount)
+        advantage = gain - baseline(gain, weight, value, squared_score)
         if discounted:
             advantage = discount_factors(discount) * advantage
         return Estimate(advantage, target)

@@ -1,4 +1,4 @@
-"""Actor and critic as flax networks, handed to the programs as three pure functions."""
+"""Actor and critic as flax networks, given to the algorithms as pure functions."""
 
 from __future__ import annotations
 
@@ -13,20 +13,20 @@ from jaxpg.distributions import SQUASHED_GAUSSIAN, Distribution
 from jaxpg.features import identity
 from jaxpg.types import PyTree
 
-# A sigma that depends on the state stays within e^-3 and e^3 times its initial value: without bounds the states that
-# are seldom visited get any sigma, and some seeds of the pendulum end at 10^5.
+# A sigma that depends on the state stays within e^-3 and e^3 times its initial value. Without bounds it drifts in
+# states that are rarely visited: with some seeds of the pendulum it ends at 10^5.
 SIGMA_RANGE = 3.0
 
 
 class Networks(NamedTuple):
-    """A policy and a value function without their parameters.
+    """A policy and a value function, as functions of their parameters.
 
     Attributes:
       init: `init(key) -> {"actor": ..., "critic": ...}`.
       policy: `policy(params["actor"], obs) -> (mean, log_std)` of the Gaussian over u, `[..., action_size]` and
-        `[action_size]`, or both `[..., action_size]` where sigma depends on the state.
+        `[action_size]`; both `[..., action_size]` if sigma depends on the state.
       value: `value(params["critic"], obs) -> V(s)`, `[...]`.
-      distribution: the actions made of u, and their densities.
+      distribution: the distribution of the actions made from u.
     """
 
     init: Callable[[jax.Array], PyTree]
@@ -51,10 +51,10 @@ class MLP(nn.Module):
 
 
 def orthogonal(gain: float) -> nn.initializers.Initializer:
-    """Weights drawn uniformly from the matrices with orthonormal rows or columns, times `gain`.
+    """Weights distributed uniformly over the matrices with orthonormal rows or columns, times `gain`.
 
-    Gram-Schmidt on a Gaussian matrix; flax's initializer of the same name asks LAPACK for a QR decomposition, and
-    batched LAPACK calls, which `vmap` over seeds would make of it, hang on some jaxlib releases.
+    Computed by Gram-Schmidt from a Gaussian matrix. Flax's initializer of the same name calls LAPACK, and under `vmap`
+    over seeds its batched calls hang on some jaxlib releases.
 
     Source: Saxe, McClelland and Ganguli, arXiv 1312.6120.
 
@@ -71,25 +71,25 @@ def orthogonal(gain: float) -> nn.initializers.Initializer:
     return init
 
 
-@jax.jit  # flax traces the initializers at every application, to compare shapes: this is traced once for each shape
+@jax.jit  # flax traces initializers at every application, to compare shapes; with jit, once per shape
 def _orthonormalize(a: jax.Array) -> jax.Array:
     """Orthonormal columns spanning the same spaces as the first 1, 2, ... columns of `a`, `[n, m]` with n >= m."""
 
     def step(q, i):
         column = a[:, i]
-        for _ in range(2):  # once loses orthogonality to rounding; twice is enough
+        for _ in range(2):  # after one pass, rounding errors remain
             column = column - q @ (q.T @ column)
         return q.at[:, i].set(column / jnp.linalg.norm(column)), None
 
     return jax.lax.scan(step, jnp.zeros_like(a), jnp.arange(a.shape[1]))[0]
 
 
-# log_std(actor, obs) -> log sigma, `[action_size]` or `[N, action_size]`, called in the actor's own scope
+# log_std(actor, obs) -> log sigma, `[action_size]` or `[N, action_size]`; called in the actor's scope
 Sigma = Callable[["GaussianActor", jax.Array], jax.Array]
 
 
 def fixed(std: float) -> Sigma:
-    """Sigma is `std`, and no parameter."""
+    """Sigma is the constant `std`."""
 
     def log_std(actor, obs):
         return _log_constant(std)(None, (actor.action_size,))
@@ -98,7 +98,7 @@ def fixed(std: float) -> Sigma:
 
 
 def learned(std: float) -> Sigma:
-    """Sigma is a parameter, at first `std`. An optimizer may also lead it along a schedule."""
+    """Sigma is a parameter with the initial value `std`; it may also be set by a schedule."""
 
     def log_std(actor, obs):
         return actor.param("log_std", _log_constant(std), (actor.action_size,))
@@ -107,11 +107,11 @@ def learned(std: float) -> Sigma:
 
 
 def state_dependent(std: float) -> Sigma:
-    """Sigma is a function of the observation, by a network like the mean's.
+    """Sigma is a function of the observation, with a network like that of the mean.
 
         log(sigma / std) = R tanh(x / R),    R = `SIGMA_RANGE`
 
-    with x the network's output, 0 or nearly so at first.
+    where x is the network's output, initially 0 or close to it.
     """
 
     def log_std(actor, obs):
@@ -126,11 +126,11 @@ def _log_constant(std: float) -> nn.initializers.Initializer:
 
 
 class GaussianActor(nn.Module):
-    """u ~ N(mu(s), sigma^2), with an MLP for the mean and one sigma for each action.
+    """u ~ N(mu(s), sigma^2), with an MLP for the mean and one sigma per action.
 
     Attributes:
-      widths, action_size, activation: of the MLP; without hidden layers the mean is linear.
-      output_gain: of the mean's last layer; 0 begins with the mean 0 everywhere.
+      widths, action_size, activation: as in `MLP`; without hidden layers the mean is linear.
+      output_gain: gain of the mean's last layer; with 0 the initial mean is 0.
       sigma: `fixed(std)`, `learned(std)` or `state_dependent(std)`.
     """
 
@@ -145,7 +145,7 @@ class GaussianActor(nn.Module):
         return self.make_mlp()(obs), self.sigma(self, obs)
 
     def make_mlp(self) -> MLP:
-        """A network of the actor's sizes; it belongs to the actor whose `__call__` asks for it."""
+        """An MLP with the actor's sizes; to be called within `__call__`."""
         return MLP(self.widths, self.action_size, self.output_gain, self.activation)
 
 
@@ -163,13 +163,13 @@ def mlp_networks(
         mu(s) = f(phi(s)),    V(s) = g(phi(s))
 
     Args:
-      observation_size, action_size: of the environment.
-      widths: hidden units by layer, the same for actor and critic.
-      activation: of the hidden layers.
-      features: phi, one of `jaxpg.features` at a given order. With the products of two observations an energy, say, is
-        linear in what the first layer sees.
-      sigma: of the Gaussian over u: `fixed(std)`, `learned(std)` or `state_dependent(std)`.
-      distribution: what is made of u.
+      observation_size, action_size: sizes of the environment.
+      widths: hidden units of each layer, the same for actor and critic.
+      activation: activation of the hidden layers.
+      features: phi, one of `jaxpg.features` at a given order. With second-order features an energy, for example, is
+        linear in the input of the first layer.
+      sigma: standard deviation of u: `fixed(std)`, `learned(std)` or `state_dependent(std)`.
+      distribution: the distribution of the actions made from u.
 
     >>> networks = mlp_networks(observation_size=3, action_size=1)
     >>> params = networks.init(jax.random.key(0))
@@ -179,7 +179,7 @@ def mlp_networks(
     """
     actor = GaussianActor(tuple(widths), action_size, activation, 0.01, sigma)
     critic = MLP(tuple(widths), 1, output_gain=1.0, activation=activation)
-    return _networks(actor, critic, features, observation_size, distribution)
+    return _make_networks(actor, critic, features, observation_size, distribution)
 
 
 def linear_networks(
@@ -189,12 +189,12 @@ def linear_networks(
     sigma: Sigma = learned(1.0),
     distribution: Distribution = SQUASHED_GAUSSIAN,
 ) -> Networks:
-    """Mean and value linear in fixed features of the observation, 0 at the beginning.
+    """Mean and value linear in fixed features of the observation, initially 0.
 
         mu(s) = W phi(s) + b,    V(s) = w' phi(s) + c
 
     Args:
-      observation_size, action_size: of the environment.
+      observation_size, action_size: sizes of the environment.
       features: phi, one of `jaxpg.features` at a given order.
       sigma, distribution: as in `mlp_networks`; a `state_dependent` sigma is linear in phi too, within its bounds.
 
@@ -208,17 +208,17 @@ def linear_networks(
     """
     actor = GaussianActor((), action_size, jnp.tanh, 0.0, sigma)
     critic = MLP((), 1, output_gain=0.0, activation=jnp.tanh)
-    return _networks(actor, critic, features, observation_size, distribution)
+    return _make_networks(actor, critic, features, observation_size, distribution)
 
 
 def linear_mean(actor: PyTree) -> tuple[jax.Array, jax.Array]:
-    """W `[action_size, features]` and b `[action_size]` of the parameters `params["actor"]` of `linear_networks`."""
+    """W `[action_size, features]` and b `[action_size]` from the parameters `params["actor"]` of `linear_networks`."""
     layer = actor["params"]["MLP_0"]["Dense_0"]
     return layer["kernel"].T, layer["bias"]
 
 
-def _networks(actor, critic, phi, observation_size: int, distribution: Distribution) -> Networks:
-    """The flax modules, applied to phi(s), as pure functions."""
+def _make_networks(actor, critic, phi, observation_size: int, distribution: Distribution) -> Networks:
+    """`Networks` of the flax modules, applied to phi(s)."""
 
     def init(key):
         key_actor, key_critic = jax.random.split(key)
@@ -226,16 +226,16 @@ def _networks(actor, critic, phi, observation_size: int, distribution: Distribut
         return {"actor": actor.init(key_actor, x), "critic": critic.init(key_critic, x)}
 
     def policy(params, obs):
-        mean, log_std = actor.apply(params, phi(_rows(obs)))
+        mean, log_std = actor.apply(params, phi(_flatten_batch(obs)))
         mean = mean.reshape(*obs.shape[:-1], -1)
         return mean, log_std.reshape(mean.shape) if log_std.ndim > 1 else log_std
 
     def value(params, obs):
-        return critic.apply(params, phi(_rows(obs))).reshape(obs.shape[:-1])
+        return critic.apply(params, phi(_flatten_batch(obs))).reshape(obs.shape[:-1])
 
     return Networks(init, policy, value, distribution)
 
 
-def _rows(obs: jax.Array) -> jax.Array:
-    """`[..., n]` as one matrix: XLA multiplies it, and above all its gradient, twice as fast as a stack of matrices."""
+def _flatten_batch(obs: jax.Array) -> jax.Array:
+    """`[..., n]` as one matrix: in XLA its products, above all in gradients, are twice as fast as a stack's."""
     return obs.reshape(-1, obs.shape[-1])

@@ -1,4 +1,4 @@
-"""Numbers that explode: an update with a number in it that is not finite is not applied."""
+"""Guards an algorithm against numbers that are not finite: updates with such numbers are not applied."""
 
 from __future__ import annotations
 
@@ -10,18 +10,18 @@ import jax.numpy as jnp
 from jaxpg.shapes import select
 from jaxpg.types import Algorithm, Metrics, PyTree, TrainState
 
-FLAGS = ("nonfinite", "nonfinite_env")  # the metrics that these functions add
+FLAGS = ("nonfinite", "nonfinite_env")  # metrics that these functions add
 
 
 def stop_at_nonfinite(algorithm: Algorithm) -> Algorithm:
-    """The algorithm, standing still from the first update whose parameters, metrics or observations are not finite.
+    """Stops the algorithm at the first update whose parameters, metrics or observations are not finite.
 
-    Such an update gives back the state as it was, its number included, so the next one is the same again: the caller
-    of `step` sees that `update` has not moved.
+    Such an update returns its state unchanged, including `update`, so all later ones repeat it. Callers of `step` can
+    tell from `update`.
 
     Returns:
-      `Algorithm(init, step)` with the further metrics `nonfinite`, int32: 0, or 1 + the place in `quantities` of the
-      first that is not finite; and `nonfinite_env`, int32: the first environment whose observation is not, or -1.
+      `Algorithm(init, step)` with two more metrics, int32. `nonfinite` is 0, or 1 + the index in `list_quantities` of
+      the first one that is not finite. `nonfinite_env` is the first environment whose observation is not finite, or -1.
     """
 
     def keep(finite: jax.Array, obs_finite: jax.Array, new: TrainState, state: TrainState) -> TrainState:
@@ -31,32 +31,32 @@ def stop_at_nonfinite(algorithm: Algorithm) -> Algorithm:
 
 
 def skip_nonfinite(algorithm: Algorithm) -> Algorithm:
-    """The algorithm without the updates whose parameters, metrics or observations are not finite.
+    """Skips the updates whose parameters, metrics or observations are not finite.
 
-    The environments go on, all that is learned stays as it was, and the next update has other random numbers.
+    In such an update the environments advance and nothing is learned; the next one has different random numbers.
 
     Returns:
       As `stop_at_nonfinite`.
     """
 
     def keep(finite: jax.Array, obs_finite: jax.Array, new: TrainState, state: TrainState) -> TrainState:
-        kept = select(finite, new, state._replace(update=new.update))
-        return kept._replace(env_state=select(obs_finite, new.env_state, state.env_state))
+        chosen = select(finite, new, state._replace(update=new.update))
+        return chosen._replace(env_state=select(obs_finite, new.env_state, state.env_state))
 
     return _guard(algorithm, keep)
 
 
 def _guard(algorithm: Algorithm, keep: Callable[..., TrainState]) -> Algorithm:
-    """The algorithm with `keep(finite, obs_finite, new, state)` after each update, and with `FLAGS`."""
+    """Applies `keep(finite, obs_finite, new, state)` after each update, and adds `FLAGS` to the metrics."""
 
     def step(state: TrainState, key: jax.Array) -> tuple[TrainState, Metrics]:
         new, metrics = algorithm.step(state, key)
-        before, after = _finite_rows(state.env_state.obs), _finite_rows(new.env_state.obs)
+        before, after = _find_finite_rows(state.env_state.obs), _find_finite_rows(new.env_state.obs)
         finite_envs = before & after
         flags = [
             jnp.all(finite_envs),
-            *(_all_finite(metrics[name]) for name in _order(metrics)),
-            _all_finite(new.params),
+            *(_is_finite(metrics[name]) for name in _sort_metrics(metrics)),
+            _is_finite(new.params),
         ]
         nonfinite = ~jnp.stack(flags)
         finite = ~jnp.any(nonfinite)
@@ -67,23 +67,23 @@ def _guard(algorithm: Algorithm, keep: Callable[..., TrainState]) -> Algorithm:
     return Algorithm(algorithm.init, step)
 
 
-def quantities(metrics: Iterable[str]) -> list[str]:
-    """What is looked at, in this order: causes before what is computed from them.
+def list_quantities(metrics: Iterable[str]) -> list[str]:
+    """The quantities that are checked, in order: causes before their effects.
 
-    >>> quantities(["gradient_norm", "nonfinite", "value_loss"])
+    >>> list_quantities(["gradient_norm", "nonfinite", "value_loss"])
     ['observation', 'value_loss', 'gradient_norm', 'parameter']
     """
-    return ["observation", *_order(metrics), "parameter"]
+    return ["observation", *_sort_metrics(metrics), "parameter"]
 
 
-def _order(metrics: Iterable[str]) -> list[str]:
+def _sort_metrics(metrics: Iterable[str]) -> list[str]:
     return sorted(set(metrics) - set(FLAGS), key=lambda name: (name == "gradient_norm", name))
 
 
-def _finite_rows(obs: jax.Array) -> jax.Array:
-    """Whether all numbers of an environment are finite, `[N]`."""
+def _find_finite_rows(obs: jax.Array) -> jax.Array:
+    """Whether all numbers of each environment are finite, `[N]`."""
     return jnp.all(jnp.isfinite(obs).reshape(len(obs), -1), axis=1)
 
 
-def _all_finite(tree: PyTree) -> jax.Array:
+def _is_finite(tree: PyTree) -> jax.Array:
     return jnp.all(jnp.stack([jnp.all(jnp.isfinite(leaf)) for leaf in jax.tree.leaves(tree)]))

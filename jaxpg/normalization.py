@@ -1,7 +1,7 @@
 """Running mean and variance of observations, as pure functions.
 
-They have no unit: observations of size 1e-5 or 1e5, or of 1e4 with a deviation of 0.1, are normalized alike. A sample
-far outside, of a simulation that is about to explode, does not spoil them.
+They work at any scale: observations of size 1e-5 or 1e5, or of 1e4 with a standard deviation of 0.1, are normalized
+alike. An extreme sample, from a simulation that is about to explode, does not spoil them.
 """
 
 from __future__ import annotations
@@ -14,11 +14,11 @@ import jax.numpy as jnp
 from jaxpg import collectives
 from jaxpg.shapes import select
 
-ERRORS = 6.0  # standard errors by which the scale of few samples may be larger than it looks
-REACH = 10.0  # deviations within which a sample is taken as it is
-TYPICAL = 1.887  # deviation over geometric mean distance, of a Gaussian: exp((log 2 + Euler's gamma) / 2)
-SPREAD = 1.111  # deviation of log |x| of a Gaussian: pi / sqrt(8)
-ROUNDING = 8.0  # units in the last place of the mean that are no variation
+ERRORS = 6.0  # standard errors by which the true scale may exceed its estimate from few samples
+REACH = 10.0  # samples beyond this many standard deviations are clipped
+TYPICAL = 1.887  # standard deviation / geometric mean of |x|, of a Gaussian: exp((log 2 + Euler's gamma) / 2)
+SPREAD = 1.111  # standard deviation of log |x|, of a Gaussian: pi / sqrt(8)
+ROUNDING = 8.0  # variation of this many units in the last place of the mean is rounding
 
 
 class RunningStatistics(NamedTuple):
@@ -36,7 +36,7 @@ class RunningStatistics(NamedTuple):
 
 
 def init(size: int) -> RunningStatistics:
-    """No samples yet: mean 0 and variance 1, so that `normalize` is the identity.
+    """Statistics of no samples: mean 0 and variance 1, so that `normalize` is the identity.
 
     >>> jnp.allclose(normalize(init(2), jnp.array([3.0, 4.0])), jnp.array([3.0, 4.0])).item()
     True
@@ -47,21 +47,20 @@ def init(size: int) -> RunningStatistics:
 def update(
     statistics: RunningStatistics, batch: jax.Array, axis_name: str | None = None, counts: jax.Array | bool = True
 ) -> RunningStatistics:
-    """The statistics with a batch added, by the pairwise rule, which does not drift.
+    """Adds a batch to the statistics, by the pairwise rule, which does not drift.
 
         d = clip(x - m, -l, l),    w = n_b / (n + n_b)
         m' = m + w mean(d),        v' = (1 - w) v + w var(d) + w (1 - w) mean(d)^2
 
-    Differences from the mean are exact where the samples themselves would lose them to rounding. Before the first
-    sample m is the batch's median. A sample further off than l (`_reach`) enters as if it were that far off: one of 1e9
-    among a hundred thousand of size 1 changes the variance by less than 1 part in 1000, and a change of scale that
-    lasts is followed.
+    Differences from the mean keep the digits that sums of the samples would lose to rounding. Before the first sample m
+    is the batch's median. Differences are clipped at l (`_clip_distance`): one sample of 1e9 among a hundred thousand
+    of size 1 changes the variance by less than 1 part in 1000, yet a lasting change of scale is followed.
 
     Args:
-      statistics: so far.
+      statistics: the statistics so far.
       batch: samples, `[..., size]`.
-      axis_name: a mapped axis, along which there are further parts of the batch.
-      counts: which samples are to be added, `[...]` of bool; whatever the others are.
+      axis_name: mapped axis over which the batch is divided.
+      counts: which samples to add, `[...]` of bool; the others may hold any numbers.
 
     Source: Chan, Golub and LeVeque, The American Statistician 37 (1983); Huber, Robust Statistics (1981).
 
@@ -77,15 +76,17 @@ def update(
     def mean(x):
         return collectives.total(jnp.sum(x, axis=0), axis_name) / jnp.maximum(number, 1)
 
-    known = statistics.count > 0
-    # Sorting is for the first batch only.
-    first = jax.lax.cond(known, lambda: jnp.zeros_like(statistics.mean), lambda: _middle(samples, counts))
-    centre = jnp.where(known, statistics.mean, collectives.mean(first, axis_name))
-    away = select(counts, samples - centre, jnp.zeros_like(samples))
-    reach = _reach(statistics, weight, away, axis_name)
-    away = jnp.clip(away, -reach, reach)
-    shift = mean(away)
-    variance = mean(select(counts, jnp.square(away - shift), jnp.zeros_like(samples)))
+    has_samples = statistics.count > 0
+    # The median needs a sort, so it is computed for the first batch only.
+    first = jax.lax.cond(
+        has_samples, lambda: jnp.zeros_like(statistics.mean), lambda: _approximate_median(samples, counts)
+    )
+    centre = jnp.where(has_samples, statistics.mean, collectives.mean(first, axis_name))
+    difference = select(counts, samples - centre, jnp.zeros_like(samples))
+    distance = _clip_distance(statistics, weight, difference, axis_name)
+    difference = jnp.clip(difference, -distance, distance)
+    shift = mean(difference)
+    variance = mean(select(counts, jnp.square(difference - shift), jnp.zeros_like(samples)))
     return RunningStatistics(
         count=count,
         mean=centre + weight * shift,
@@ -93,41 +94,43 @@ def update(
     )
 
 
-def _middle(samples: jax.Array, counts: jax.Array, number: int = 256) -> jax.Array:
-    """About the median, `[size]`: that of evenly spaced samples; 0 where none of them counts."""
+def _approximate_median(samples: jax.Array, counts: jax.Array, number: int = 256) -> jax.Array:
+    """Median of about `number` evenly spaced samples, `[size]`; 0 if none of them counts."""
     step = max(len(samples) // number, 1)
-    some = select(counts[::step], samples[::step], jnp.full_like(samples[::step], jnp.nan))
-    median = jnp.nanmedian(some, axis=0)
+    subset = select(counts[::step], samples[::step], jnp.full_like(samples[::step], jnp.nan))
+    median = jnp.nanmedian(subset, axis=0)
     return jnp.where(jnp.isnan(median), 0.0, median)
 
 
-def _reach(statistics: RunningStatistics, weight: jax.Array, away: jax.Array, axis_name: str | None) -> jax.Array:
-    """How far from the mean a sample is taken as it is, `[size]`.
+def _clip_distance(
+    statistics: RunningStatistics, weight: jax.Array, difference: jax.Array, axis_name: str | None
+) -> jax.Array:
+    """The distance from the mean at which samples are clipped, `[size]`.
 
         l = 10 max(s, s^(1 - a) s_b^a),    s = sqrt(v),    a = min(1, 10 w)
         s_b = 1.887 exp(mean log |x - m| + 6 (1.111 / sqrt(k)))
 
-    s_b is the batch's own scale, by the geometric mean: that of a few enormous samples among many is that of the many.
-    Of k samples it is as large as six standard errors of the mean of logarithms allow: in a batch of five, three may
-    lie close together by chance. Alone it decides as long as there is no variation, and as long as the batch is a tenth
-    of all samples.
+    s_b estimates the batch's scale by the geometric mean, which a few enormous samples hardly change. It is raised by
+    six standard errors of the mean of the logarithms of k samples: in a batch of five, three may lie close together by
+    chance. It is used alone while nothing has varied yet, and while the batch is at least a tenth of all samples.
     """
-    moved = away != 0
-    logarithms = jnp.where(moved, jnp.log(jnp.abs(jnp.where(moved, away, 1.0))), 0.0)
-    sums = jnp.stack([jnp.sum(logarithms, axis=0), jnp.sum(moved, axis=0, dtype=away.dtype)])
+    nonzero = difference != 0
+    logarithms = jnp.where(nonzero, jnp.log(jnp.abs(jnp.where(nonzero, difference, 1.0))), 0.0)
+    sums = jnp.stack([jnp.sum(logarithms, axis=0), jnp.sum(nonzero, axis=0, dtype=difference.dtype)])
     total, number = collectives.total(sums, axis_name)
     number = jnp.maximum(number, 1)
-    own = jnp.log(TYPICAL) + total / number + ERRORS * SPREAD * jax.lax.rsqrt(number)
-    known = (statistics.count > 0) & (statistics.variance > 0)
-    so_far = jnp.where(known, 0.5 * jnp.log(jnp.where(known, statistics.variance, 1.0)), own)
+    log_batch_scale = jnp.log(TYPICAL) + total / number + ERRORS * SPREAD * jax.lax.rsqrt(number)
+    has_varied = (statistics.count > 0) & (statistics.variance > 0)
+    log_variance = jnp.log(jnp.where(has_varied, statistics.variance, 1.0))
+    log_scale = jnp.where(has_varied, 0.5 * log_variance, log_batch_scale)
     trust = jnp.minimum(1.0, 10 * weight)
-    return REACH * jnp.exp(jnp.maximum(so_far, (1 - trust) * so_far + trust * own))
+    return REACH * jnp.exp(jnp.maximum(log_scale, (1 - trust) * log_scale + trust * log_batch_scale))
 
 
 def inverse_deviation(statistics: RunningStatistics) -> jax.Array:
-    """1 / sqrt(variance + (8 eps mean)^2), `[size]`: the factor of `normalize`; 0 where nothing varies.
+    """1 / sqrt(variance + (8 eps mean)^2), `[size]`: the factor of `normalize`; 0 for a constant component.
 
-    eps is the distance of floating-point numbers near 1: variation in the last places of the mean is rounding.
+    eps is the spacing of floating-point numbers at 1: variation in the last places of the mean is rounding.
     """
     rounding = ROUNDING * jnp.finfo(statistics.mean.dtype).eps * statistics.mean
     variance = statistics.variance + rounding**2
@@ -146,5 +149,5 @@ def normalize(statistics: RunningStatistics, x: jax.Array) -> jax.Array:
 
 
 def near(statistics: RunningStatistics, x: jax.Array, deviations: float) -> jax.Array:
-    """Whether all components are within so many deviations of their means, `[...]` of `[..., size]`; NaN is not."""
+    """Whether all components are within `deviations` standard deviations of the mean, `[...]`; false for NaN."""
     return jnp.all(jnp.abs(normalize(statistics, x)) <= deviations, axis=-1)

@@ -1,4 +1,4 @@
-"""What a trained actor-critic does and expects, without what it was trained with."""
+"""The policy and the value function of a trained actor-critic, independent of its training."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ PolicyFn = Callable[[jax.Array, jax.Array], tuple[jax.Array, jax.Array]]
 def deterministic_policy(
     networks: Networks, params: PyTree, normalizer: RunningStatistics
 ) -> Callable[[jax.Array], jax.Array]:
-    """`policy(obs) -> action`: that of the Gaussian's mean."""
+    """`policy(obs) -> action`: the action at the Gaussian's mean."""
 
     def policy(obs):
         mean, _ = networks.policy(params["actor"], normalization.normalize(normalizer, obs))
@@ -29,7 +29,7 @@ def deterministic_policy(
 
 
 def sampling_policy(networks: Networks, params: PyTree, normalizer: PyTree) -> PolicyFn:
-    """`policy_fn(obs, key) -> (u, action)`, drawn from the Gaussian."""
+    """`policy_fn(obs, key) -> (u, action)`, sampled from the Gaussian."""
 
     def policy_fn(obs, key):
         mean, log_std = networks.policy(params["actor"], normalization.normalize(normalizer, obs))
@@ -42,11 +42,11 @@ def sampling_policy(networks: Networks, params: PyTree, normalizer: PyTree) -> P
 def value_function(
     networks: Networks, params: PyTree, normalizer: RunningStatistics, reward_scale: float = 1.0
 ) -> Callable[[jax.Array], jax.Array]:
-    """`value(obs) -> V`: what the critic expects of the discounted rewards to come, in the rewards' own units.
+    """`value(obs) -> V`: the critic's estimate of the discounted future rewards, in units of the unscaled rewards.
 
     Args:
-      networks, params, normalizer: of the policy.
-      reward_scale: the factor on the rewards that the critic has learned from.
+      networks, params, normalizer: as in `deterministic_policy`.
+      reward_scale: factor on the rewards in training.
     """
 
     def value(obs):

@@ -1,4 +1,4 @@
-"""What runs need of the system, and Windows has not: locks on files, names of open folders, limits of memory."""
+"""POSIX modules that runs need and Windows lacks: file locks, names of open folders, memory limits."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Proximal policy optimization: several gradient steps on the clipped surrogate for each rollout.
+"""Proximal policy optimization: several gradient steps on the clipped surrogate per rollout.
 
 Source: Schulman et al., Proximal policy optimization algorithms, arXiv 1707.06347.
 """
@@ -36,16 +36,16 @@ def ppo(
     axis_name: str | None = None,
     **options: Any,
 ) -> Algorithm:
-    """PPO: `actor_critic` with several steps on the clipped surrogate in the place of one.
+    """PPO: `actor_critic` with several steps on the clipped surrogate instead of one.
 
     Args:
       env, networks, optimizer, method, axis_name: as in `jaxpg.actor_critic.on_policy`.
       epochs, minibatches, max_kl: as in `minibatch_steps`.
       clip, value_clip, entropy_coef: as in `ppo_loss`.
-      options: further ones of `on_policy`.
+      options: other options of `on_policy`.
 
     Returns:
-      As `on_policy`, with the further metrics `kl` and `gradient_steps`.
+      As `on_policy`, with the additional metrics `kl` and `gradient_steps`.
     """
     loss = ppo_loss(networks, entropy_coef, clip, value_clip)
     update = minibatch_steps(loss, optimizer, epochs, minibatches, max_kl, axis_name)
@@ -55,7 +55,7 @@ def ppo(
 def ppo_loss(
     networks: Networks, entropy_coef: float = 0.0, clip: float | None = 0.2, value_clip: float | None = None
 ) -> Loss:
-    """The clipped surrogate, the critic's squared error and the entropy bonus; `kl` is among the metrics.
+    """The clipped surrogate, the critic's squared error and the entropy bonus; the metrics include `kl`.
 
         L(theta, w) = L_clip(theta) + L_V(w) - entropy_coef mean(H_t)
 
@@ -87,55 +87,55 @@ def minibatch_steps(
     max_kl: float | None = None,
     axis_name: str | None = None,
 ) -> Update:
-    """`epochs` passes over the batch, one gradient step on each minibatch; metrics are means over the steps taken.
+    """`epochs` passes over the batch, with one gradient step per minibatch; metrics are means over the steps taken.
 
     Args:
       loss, optimizer, axis_name: as in `jaxpg.updates.gradient_step`.
-      epochs: passes over the rollout, each in another order.
-      minibatches: gradient steps of a pass, each on its share of the environments; divides their number.
-      max_kl: the remaining gradient steps are left out once the policy is further than this from the one that acted:
-        the mean of KL(acted || now) over a minibatch; None takes all of them.
+      epochs: passes over the rollout, each in a different order.
+      minibatches: gradient steps per pass, each on an equal share of the environments; must divide their number.
+      max_kl: the remaining gradient steps are skipped once the policy is further than this from the one that acted, by
+        the mean of KL(acted || current) over a minibatch; None takes all steps.
     """
     step = gradient_step(loss, optimizer, axis_name)
     num_steps = epochs * minibatches
 
-    def take(carry, numbered_minibatch):
-        (params, opt_state, near), (number, minibatch) = carry, numbered_minibatch
+    def take_step(carry, numbered_minibatch):
+        (params, opt_state, is_near), (number, minibatch) = carry, numbered_minibatch
         params, opt_state, metrics = step(params, opt_state, minibatch, number=number)
-        return (params, opt_state, near), metrics | {"gradient_steps": jnp.ones(())}
+        return (params, opt_state, is_near), metrics | {"gradient_steps": jnp.ones(())}
 
-    def take_while_near(carry, numbered_minibatch):
+    def take_step_if_near(carry, numbered_minibatch):
         def attempt():
-            (params, opt_state, _), metrics = take(carry, numbered_minibatch)
-            near = metrics["kl"] <= max_kl  # of the parameters before the step
-            taken = jax.tree.map(lambda new, old: jnp.where(near, new, old), (params, opt_state), carry[:2])
-            return (*taken, near), jax.tree.map(lambda x: near * x, metrics)
+            (params, opt_state, _), metrics = take_step(carry, numbered_minibatch)
+            is_near = metrics["kl"] <= max_kl  # the KL divergence before the step
+            selected = jax.tree.map(lambda new, old: jnp.where(is_near, new, old), (params, opt_state), carry[:2])
+            return (*selected, is_near), jax.tree.map(lambda x: is_near * x, metrics)
 
-        nothing = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), jax.eval_shape(attempt)[1])
-        return jax.lax.cond(carry[2], attempt, lambda: (carry, nothing))
+        zeros = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), jax.eval_shape(attempt)[1])
+        return jax.lax.cond(carry[2], attempt, lambda: (carry, zeros))
 
-    one = take if max_kl is None else take_while_near
+    scan_step = take_step if max_kl is None else take_step_if_near
 
     def update(params, opt_state, batch, key, number=0):
         def epoch(carry, numbers_and_key):
             numbers, key = numbers_and_key
-            return jax.lax.scan(one, carry, (numbers, split_environments(batch, key, minibatches)))
+            return jax.lax.scan(scan_step, carry, (numbers, split_environments(batch, key, minibatches)))
 
         carry = params, opt_state, jnp.array(True)
         numbers = jnp.arange(num_steps, dtype=jnp.int32).reshape(epochs, minibatches)
         keys = jax.random.split(key, epochs)
         (params, opt_state, _), metrics = jax.lax.scan(epoch, carry, (number * num_steps + numbers, keys))
-        taken = jnp.sum(metrics["gradient_steps"])
-        metrics = {name: jnp.sum(x) / jnp.maximum(taken, 1) for name, x in metrics.items()}
-        return params, opt_state, metrics | {"gradient_steps": taken}
+        num_taken = jnp.sum(metrics["gradient_steps"])
+        metrics = {name: jnp.sum(x) / jnp.maximum(num_taken, 1) for name, x in metrics.items()}
+        return params, opt_state, metrics | {"gradient_steps": num_taken}
 
     return update
 
 
 def split_environments(batch: PyTree, key: jax.Array, number: int) -> PyTree:
-    """The environments of a batch `[T, N, ...]` in `number` minibatches `[number, T, N / number, ...]`.
+    """Splits the environments of a batch `[T, N, ...]` into `number` minibatches `[number, T, N / number, ...]`.
 
-    Neighbours stay neighbours: the minibatches begin at a random environment, which costs a copy and not a gather.
+    Minibatches are blocks of neighbouring environments, starting at a random one, which costs a copy and not a gather.
     """
     num_envs = batch.advantage.shape[1]
     shift = jax.random.randint(key, (), 0, num_envs)

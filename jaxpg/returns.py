@@ -1,8 +1,8 @@
-"""Returns of a trajectory: one reverse recursion, four readings of it.
+"""Returns of a trajectory: four uses of one reverse recursion.
 
-Every array has time first and any batch shape after it. The discount d_t stands for gamma (1 - terminated_t): gamma
-inside an episode, 0 where step t ended in a terminal state. Where an episode was cut for another reason (time limit,
-end of the rollout), set lambda_t to 0: the sum stops there and bootstraps from the value of the true next observation.
+Every array has time first and any batch shape after it. The discount d_t is gamma (1 - terminated_t): gamma inside an
+episode, 0 if step t ended in a terminal state. If an episode was cut for another reason (time limit, end of the
+rollout), set lambda_t to 0: the sum stops there and bootstraps from the value of the true next observation.
 """
 
 from __future__ import annotations
@@ -10,18 +10,18 @@ from __future__ import annotations
 import jax
 import jax.numpy as jnp
 
-from jaxpg.shapes import broadcast_scalar, floating
+from jaxpg.shapes import broadcast_scalar, to_floating
 
 
 def discounted_returns(reward: jax.Array, discount: jax.Array | float, bootstrap: jax.Array | float) -> jax.Array:
-    """Discounted sum of the rewards to come (reward-to-go).
+    """Discounted sum of future rewards (reward-to-go).
 
         G_t = r_t + d_t G_{t+1},    G_T = bootstrap
 
     Args:
       reward: r_t, `[T, ...]`.
-      discount: d_t, `[T, ...]` or a scalar; 0 where the episode ended with step t.
-      bootstrap: value of what follows the last step, `[...]` or a scalar; 0 for a complete episode.
+      discount: d_t, `[T, ...]` or a scalar; 0 if step t ended the episode.
+      bootstrap: value after the last step, `[...]` or a scalar; 0 for a complete episode.
 
     Returns:
       G_t, `[T, ...]`.
@@ -34,7 +34,7 @@ def discounted_returns(reward: jax.Array, discount: jax.Array | float, bootstrap
     >>> discounted_returns(jnp.array([1.0, 1.0, 1.0]), 0.5, 8.0).tolist()
     [2.75, 3.5, 5.0]
     """
-    reward = floating(reward)
+    reward = to_floating(reward)
     discount = broadcast_scalar(discount, reward, "discount")
     bootstrap = broadcast_scalar(bootstrap, reward[0], "bootstrap")
     return _backward(reward, discount, bootstrap)
@@ -45,11 +45,11 @@ def discount_factors(discount: jax.Array) -> jax.Array:
 
         d_0 d_1 ... d_{t-1},    1 at t = 0
 
-    Times the advantages of `jaxpg.estimators` it makes the estimate that of grad J. The lesson's section 3, and nearly
-    every program, leaves it out: steps late in an episode then count as much as early ones.
+    Multiplying the advantages of `jaxpg.estimators` by it gives an estimate of grad J. The lesson's section 3, like
+    nearly every program, leaves it out: late steps of an episode then count as much as early ones.
 
     Args:
-      discount: d_t, `[T, ...]`, of trajectories that begin at t = 0.
+      discount: d_t, `[T, ...]`, for trajectories that begin at t = 0.
 
     Returns:
       `[T, ...]`.
@@ -59,7 +59,7 @@ def discount_factors(discount: jax.Array) -> jax.Array:
     >>> discount_factors(jnp.array([0.5, 0.5, 0.5])).tolist()
     [1.0, 0.5, 0.25]
     """
-    discount = floating(discount)
+    discount = to_floating(discount)
     return jnp.cumprod(jnp.concatenate([jnp.ones_like(discount[:1]), discount[:-1]]), axis=0)
 
 
@@ -85,7 +85,7 @@ def td_errors(reward: jax.Array, discount: jax.Array | float, value: jax.Array, 
     >>> td_errors(jnp.array([1.0]), 0.5, jnp.array([2.0]), jnp.array([4.0])).tolist()
     [1.0]
     """
-    reward = floating(reward)
+    reward = to_floating(reward)
     discount = broadcast_scalar(discount, reward, "discount")
     return (
         reward
@@ -112,8 +112,8 @@ def n_step_returns(
       reward: r_t, `[T, ...]`.
       discount: d_t, `[T, ...]` or a scalar; 0 where s_{t+1} is terminal.
       next_value: V of the true s_{t+1}, `[T, ...]`.
-      n: how many rewards to sum, at least 1; n >= T is the whole trajectory.
-      continues: c_t, 1 where step t + 1 goes on with the same episode and 0 at a cut, `[T, ...]` or a scalar.
+      n: number of rewards to sum, at least 1; n >= T sums the whole trajectory.
+      continues: c_t, 1 if step t + 1 continues the same episode and 0 at a cut, `[T, ...]` or a scalar.
 
     Returns:
       G^(n)_t, `[T, ...]`.
@@ -128,7 +128,7 @@ def n_step_returns(
     """
     if n < 1:
         raise ValueError(f"n must be at least 1, got {n}")
-    reward = floating(reward)
+    reward = to_floating(reward)
     discount = broadcast_scalar(discount, reward, "discount")
     next_value = broadcast_scalar(next_value, reward, "next_value")
     continues = broadcast_scalar(continues, reward, "continues")
@@ -150,7 +150,7 @@ def lambda_returns(
         G_t = r_t + d_t ((1 - lambda_t) V(s_{t+1}) + lambda_t G_{t+1}),    G_T = V(s_T)
 
     lambda = 0 gives the one-step target, lambda = 1 the Monte Carlo return. At a cut set lambda_t = 0: the sum stops
-    there and bootstraps. At a termination d_t = 0 already does so with value 0.
+    there and bootstraps. At a termination d_t = 0 already stops it, with value 0.
 
     Args:
       reward: r_t, `[T, ...]`.
@@ -170,7 +170,7 @@ def lambda_returns(
     >>> lambda_returns(jnp.array([1.0, 1.0]), 0.5, jnp.array([4.0, 8.0]), 0.5).tolist()
     [3.25, 5.0]
     """
-    reward = floating(reward)
+    reward = to_floating(reward)
     discount = broadcast_scalar(discount, reward, "discount")
     next_value = broadcast_scalar(next_value, reward, "next_value")
     lambda_ = broadcast_scalar(lambda_, reward, "lambda_")

@@ -1,4 +1,4 @@
-"""Acting in the environments for some steps, as one scan."""
+"""Rollouts: a policy acts in the environments, as one scan."""
 
 from __future__ import annotations
 
@@ -19,14 +19,14 @@ def rollout(
         u_t, a_t ~ policy_fn(s_t),    s_{t+1}, r_t ~ env_step(s_t, a_t)
 
     Args:
-      policy_fn: `policy_fn(obs, key) -> (u, action)`, what the Gaussian drew and what the environment gets.
+      policy_fn: `policy_fn(obs, key) -> (u, action)`: the Gaussian's sample, and the action for the environment.
       env_step: `VectorEnv.step`.
-      env_state: where to start.
-      key: random key of the whole rollout.
+      env_state: initial state of the environments.
+      key: random key for the whole rollout.
       length: T, at least 1.
 
     Returns:
-      The environments after the last step, and the `Transition`, each field `[T, N, ...]`.
+      The state of the environments after the last step, and the `Transition`, with fields `[T, N, ...]`.
     """
 
     def step(env_state, key):

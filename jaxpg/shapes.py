@@ -1,6 +1,6 @@
-"""One rule for shapes: a scalar is spread over the other array, any other shape must be the same.
+"""One rule for shapes: scalars broadcast, any other shapes must be equal.
 
-Without it `[N]` against `[N, 1]` would be spread in silence to `[N, N]`.
+Without it `[N]` and `[N, 1]` would silently broadcast to `[N, N]`.
 """
 
 from __future__ import annotations
@@ -11,21 +11,21 @@ import jax
 import jax.numpy as jnp
 
 
-def floating(x: jax.Array) -> jax.Array:
+def to_floating(x: jax.Array) -> jax.Array:
     """`x` as an array of floating-point numbers: integers would round discounts to 0."""
     return jnp.asarray(x, jnp.result_type(x, 0.0))
 
 
 def broadcast_scalar(x: jax.Array | float, reference: jax.Array, name: str) -> jax.Array:
-    """`x` in the reference's shape and type.
+    """`x` with the shape and dtype of the reference.
 
     Args:
       x: a scalar, or an array of the reference's shape.
       reference: `[...]`.
-      name: what x is called in the message.
+      name: name of x in the error message.
 
     Raises:
-      ValueError: x has another shape.
+      ValueError: x is neither a scalar nor of the reference's shape.
 
     >>> broadcast_scalar(0.5, jnp.ones(2), "discount").tolist()
     [0.5, 0.5]
@@ -37,7 +37,7 @@ def broadcast_scalar(x: jax.Array | float, reference: jax.Array, name: str) -> j
 
 
 def expand_like(x: jax.Array, reference: jax.Array) -> jax.Array:
-    """`x`, `[N]`, with as many axes as the reference, `[N, ...]`: one number for each of its rows.
+    """Reshapes `x`, `[N]`, to broadcast over the rows of the reference, `[N, ...]`.
 
     >>> expand_like(jnp.ones(3), jnp.ones((3, 2, 4))).shape
     (3, 1, 1)
@@ -46,9 +46,9 @@ def expand_like(x: jax.Array, reference: jax.Array) -> jax.Array:
 
 
 def select(mask: jax.Array, if_true: Any, if_false: Any) -> Any:
-    """Leaf by leaf of two trees `[N, ...]`: the rows of `if_true` where the mask holds, `[N]` or with further axes.
+    """Selects rows of two trees, leaves `[N, ...]`: those of `if_true` where the mask, `[N, ...]`, is true.
 
-    It selects and does not multiply: what is not finite in a row that is left out stays out.
+    It does not multiply, so NaN and infinity in rows that are not selected do not matter.
 
     >>> select(jnp.array([True, False]), jnp.array([[1.0], [jnp.nan]]), jnp.zeros((2, 1))).tolist()
     [[1.0], [0.0]]
@@ -61,7 +61,7 @@ def select(mask: jax.Array, if_true: Any, if_false: Any) -> Any:
 
 
 def check_shape(x: jax.Array, reference: jax.Array, name: str) -> jax.Array:
-    """`x`, which must have the reference's shape; raises ValueError where it has another."""
+    """Returns `x`; raises ValueError if its shape is not the reference's."""
     if x.shape != reference.shape:
         raise ValueError(f"{name} has shape {x.shape}, expected {reference.shape}")
     return x

@@ -1,4 +1,4 @@
-"""The values that pass between the parts, with their shapes: T steps, N environments, time first."""
+"""Shared data types with their shapes: T steps, N environments, time first."""
 
 from __future__ import annotations
 
@@ -16,15 +16,15 @@ class Transition(NamedTuple):
 
     Attributes:
       obs: s_t, `[T, N, observation_size]`.
-      u: u_t, what the policy's Gaussian drew, `[T, N, action_size]`; the environment took the action made of it.
+      u: u_t, the sample of the policy's Gaussian, `[T, N, action_size]`, from which the action was made.
       reward: r_t, `[T, N]`.
-      terminated: 1.0 where the step ended in a terminal state, whose value is 0, `[T, N]`.
-      truncated: 1.0 where a time limit cut the episode after the step, `[T, N]`; never together with `terminated`.
-      next_obs: the true s_{t+1}, the one before any reset, `[T, N, observation_size]`.
-      episode_end: 1.0 where a whole episode, played from its first step, ended with the step, `[T, N]`.
-      episode_return: the undiscounted return of that episode, 0 where none ended, `[T, N]`.
-      diverged: 1.0 where the physics did (`jaxpg.divergence`), `[T, N]`; the step terminated, with reward 0 and the
-        observation before it as the true next one.
+      terminated: 1.0 if the step ended in a terminal state, whose value is 0, `[T, N]`.
+      truncated: 1.0 if a time limit cut the episode after the step, `[T, N]`; never together with `terminated`.
+      next_obs: the true s_{t+1}, before any reset, `[T, N, observation_size]`.
+      episode_end: 1.0 if the step ended an episode that was played from its first step, `[T, N]`.
+      episode_return: the undiscounted return of that episode, 0 if there is none, `[T, N]`.
+      diverged: 1.0 if the physics diverged (`jaxpg.divergence`), `[T, N]`; the step then terminates with reward 0, and
+        its next observation is the one before it.
     """
 
     obs: jax.Array
@@ -39,12 +39,12 @@ class Transition(NamedTuple):
 
     @property
     def ended(self) -> jax.Array:
-        """Whether an episode ended with the step, `[T, N]` of bool."""
+        """Whether the step ended an episode, `[T, N]` of bool."""
         return (self.terminated + self.truncated) > 0
 
 
 class TrainState(NamedTuple):
-    """Everything that the next update needs; a checkpoint holds all of it.
+    """Everything that the next update needs; a checkpoint contains all of it.
 
     Attributes:
       params: the networks' parameters, `{"actor": ..., "critic": ...}`.
@@ -62,7 +62,7 @@ class TrainState(NamedTuple):
 
 
 class Algorithm(NamedTuple):
-    """A learning algorithm as a state machine of pure functions.
+    """A learning algorithm as a pair of pure functions.
 
     Attributes:
       init: `init(key) -> TrainState`.

@@ -1,4 +1,4 @@
-"""Updates: what a rollout changes in the parameters, by gradient steps on a loss of actor and critic."""
+"""Updates of the parameters from a rollout, by gradient steps on the loss of actor and critic."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from jaxpg.types import Metrics, PyTree
 
 # loss(params, batch) -> (L, metrics)
 Loss = Callable[[PyTree, Batch], tuple[jax.Array, Metrics]]
-# update(params, opt_state, batch, key, number) -> (params, opt_state, metrics), where `number` updates came before
+# update(params, opt_state, batch, key, number) -> (params, opt_state, metrics), after `number` earlier updates
 Update = Callable[[PyTree, PyTree, Batch, jax.Array, jax.Array | int], tuple[PyTree, PyTree, Metrics]]
 # policy_loss(batch, mean, log_std, log_prob) -> (L_pi, metrics)
 PolicyLoss = Callable[[Batch, jax.Array, jax.Array, jax.Array], tuple[jax.Array, Metrics]]
@@ -49,10 +49,10 @@ def sum_of_losses(networks: Networks, entropy_coef: float, policy_loss: PolicyLo
         value = networks.value(params["critic"], batch.obs)
         mean, log_std = networks.policy(params["actor"], batch.obs)
         log_prob = networks.distribution.log_prob(batch.u, mean, log_std)
-        of_policy, metrics = policy_loss(batch, mean, log_std, log_prob)
+        policy_term, metrics = policy_loss(batch, mean, log_std, log_prob)
         entropy = networks.distribution.entropy(batch.u, mean, log_std)
         losses = {
-            "policy_loss": of_policy,
+            "policy_loss": policy_term,
             "value_loss": critic_loss(batch, value),
             "entropy": -entropy_loss(entropy, batch.weight),
         }
@@ -66,10 +66,10 @@ def gradient_step(loss: Loss, optimizer: optax.GradientTransformation, axis_name
     """One gradient step on the whole batch.
 
     Args:
-      loss: of the parameters and the batch.
-      optimizer: of the parameters. One that takes further arguments, as `scale_by_progress` does, is told the number of
-        updates before this one.
-      axis_name: a mapped axis, along which there are further parts of the batch.
+      loss: `loss(params, batch) -> (L, metrics)`.
+      optimizer: optimizer of the parameters. One with extra arguments, such as `scale_by_progress`, is given the number
+        of earlier updates as `progress`.
+      axis_name: mapped axis over which the batch is divided.
     """
     optimizer = optax.with_extra_args_support(optimizer)
 
@@ -83,14 +83,14 @@ def gradient_step(loss: Loss, optimizer: optax.GradientTransformation, axis_name
 
 
 def scale_by_progress(schedule: optax.Schedule) -> optax.GradientTransformationExtraArgs:
-    """Gradients times `schedule(progress)`, the last part of an optimizer whose step size changes.
+    """Scales updates by `schedule(progress)`, as the last part of an optimizer whose step size changes.
 
-    `optax.scale_by_schedule` counts the steps that it has taken. Here the step size belongs to a point of the training
-    and not to its history: steps that were left out, as beyond PPO's `max_kl`, count as if they had been taken.
+    `optax.scale_by_schedule` counts the steps it has taken. Here the step size depends on the progress of the training
+    instead: steps that were skipped, as beyond PPO's `max_kl`, count as taken.
 
     Args:
-      schedule: of the gradient steps that the training had room for before this one: with u updates made and K steps in
-        each, u K and those before it in its own.
+      schedule: function of the number of earlier gradient steps, taken or skipped: after u updates of K steps each, u K
+        plus those before it in the current update.
     """
 
     def init(params):

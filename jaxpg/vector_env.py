@@ -1,11 +1,11 @@
 """Many environments side by side: time limit, resets, and the true next observation.
 
 The environment is any object with brax's `reset(key) -> State` and `step(State, action) -> State`. Its `done` means
-termination; the time limit is added here, as truncation. An environment that ended is reset at once with a fresh draw,
-and the observation from *before* the reset is handed out as s_{t+1}, for the bootstrap.
+termination; the time limit is added here, as truncation. An environment whose episode ended is reset at once with a
+fresh draw, and the observation from *before* the reset is returned as s_{t+1}, for the bootstrap.
 
-A physics that diverges, as stiff models do at long time steps, ends the episode of its environment and no other's; what
-that is, `jaxpg.divergence` says.
+If the physics of an environment diverges (`jaxpg.divergence`), as with stiff models at long time steps, only its own
+episode ends.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ import jax
 import jax.numpy as jnp
 
 from jaxpg import collectives
-from jaxpg.divergence import diverged
+from jaxpg.divergence import has_diverged
 from jaxpg.shapes import select
 from jaxpg.types import Metrics, Transition
 
@@ -26,10 +26,10 @@ class VectorState(NamedTuple):
     """N running episodes.
 
     Attributes:
-      env: the environment's own State, every leaf with a leading axis `[N, ...]`.
+      env: the environment's State, with a leading axis on every leaf, `[N, ...]`.
       time: steps since the last reset, `[N]` int32.
       episode_return: undiscounted return since the last reset, `[N]`.
-      whole: 1.0 where the episode is played from its first step, `[N]`; see `stagger`.
+      whole: 1.0 if the episode was played from its first step, `[N]`; see `stagger`.
     """
 
     env: Any
@@ -44,7 +44,7 @@ class VectorState(NamedTuple):
 
 
 class Outcome(NamedTuple):
-    """What one step of all environments brought; fields as in `jaxpg.types.Transition`, without the time axis."""
+    """The result of one step of all environments; fields as in `jaxpg.types.Transition`, without the time axis."""
 
     reward: jax.Array
     terminated: jax.Array
@@ -73,10 +73,10 @@ class VectorEnv(NamedTuple):
 
 
 def vectorize(env: Any, num_envs: int, episode_length: int) -> VectorEnv:
-    """`num_envs` copies of `env`, each ended after `episode_length` steps at the latest and then reset.
+    """`num_envs` copies of `env`, whose episodes end after at most `episode_length` steps and are then reset.
 
     Args:
-      env: brax-shaped environment with an array as observation.
+      env: environment with brax's interface, whose observation is an array.
       num_envs: N, at least 1.
       episode_length: steps until the time limit, at least 1.
     """
@@ -88,12 +88,12 @@ def vectorize(env: Any, num_envs: int, episode_length: int) -> VectorEnv:
 
     def step(state, action, key):
         env_state = jax.vmap(env.step)(state.env, action)
-        exploded = jax.vmap(diverged)(state.env, env_state)
-        reward = jnp.where(exploded, 0.0, env_state.reward)
-        next_obs = select(exploded, state.obs, env_state.obs)
+        diverged = jax.vmap(has_diverged)(state.env, env_state)
+        reward = jnp.where(diverged, 0.0, env_state.reward)
+        next_obs = select(diverged, state.obs, env_state.obs)
         time = state.time + 1
         episode_return = state.episode_return + reward
-        terminated = jnp.where(exploded, 1, env_state.done).astype(reward.dtype)
+        terminated = jnp.where(diverged, 1, env_state.done).astype(reward.dtype)
         truncated = (time >= episode_length) * (1 - terminated)
         done = (terminated + truncated) > 0
         episode_end = done * state.whole
@@ -104,41 +104,41 @@ def vectorize(env: Any, num_envs: int, episode_length: int) -> VectorEnv:
             next_obs=next_obs,
             episode_end=episode_end,
             episode_return=episode_end * episode_return,
-            diverged=exploded.astype(reward.dtype),
+            diverged=diverged.astype(reward.dtype),
         )
         running = VectorState(env_state, time, episode_return, state.whole)
-        # Drawing and observing new states costs as much as a step in some environments: only where one has ended.
+        # In some environments a reset costs as much as a step, so it is computed only if an episode has ended.
         return jax.lax.cond(jnp.any(done), lambda: select(done, reset(key), running), lambda: running), outcome
 
     return VectorEnv(reset, step, env.observation_size, env.action_size, num_envs, episode_length)
 
 
 def stagger(state: VectorState, key: jax.Array, episode_length: int) -> VectorState:
-    """Fresh episodes moved to random points of their time limit: t_i ~ U{0, ..., episode_length - 1}.
+    """Moves fresh episodes to random points before the time limit: t_i ~ U{0, ..., episode_length - 1}.
 
-    Without it all environments reach the time limit together for ever, and a short rollout sees one phase of the
-    episode only. The shortened first episodes are not counted as episodes.
+    Without it all environments would always reach the time limit together, and a short rollout would see only one phase
+    of the episode. The shortened first episodes do not count as episodes.
     """
     time = jax.random.randint(key, state.time.shape, 0, episode_length)
     return state._replace(time=time, whole=(time == 0).astype(state.whole.dtype))
 
 
 def episode_metrics(transition: Transition, axis_name: str | None = None) -> Metrics:
-    """What a rollout says of its episodes.
+    """Metrics of the episodes that ended in a rollout.
 
-    `episodes` that ended and `return_sum`, the sum of their returns; `diverged`, how often the physics did, and
-    `diverged_env`, the first environment with it, or -1. An episode that diverged is in neither of the first two.
+    `episodes` is their number and `return_sum` the sum of their returns, both without episodes that diverged.
+    `diverged` is how often the physics diverged, and `diverged_env` the first environment in which it did, or -1.
 
     Args:
-      transition: of a rollout.
-      axis_name: a mapped axis, along which there are further environments.
+      transition: the rollout.
+      axis_name: mapped axis over which the environments are divided.
     """
-    exploded = transition.diverged > 0
-    counted = {
-        "return_sum": jnp.where(exploded, 0.0, transition.episode_return),
-        "episodes": jnp.where(exploded, 0.0, transition.episode_end),
+    diverged = transition.diverged > 0
+    terms = {
+        "return_sum": jnp.where(diverged, 0.0, transition.episode_return),
+        "episodes": jnp.where(diverged, 0.0, transition.episode_end),
         "diverged": transition.diverged,
     }
-    counts = {name: collectives.total(jnp.sum(x), axis_name) for name, x in counted.items()}
-    where = jnp.any(exploded, axis=0)
-    return counts | {"diverged_env": collectives.first_place(where, axis_name)}
+    sums = {name: collectives.total(jnp.sum(x), axis_name) for name, x in terms.items()}
+    where = jnp.any(diverged, axis=0)
+    return sums | {"diverged_env": collectives.find_first(where, axis_name)}

@@ -13,7 +13,7 @@ from envs.base import State
 from jaxpg import normalization
 from jaxpg.actor_critic import actor_critic
 from jaxpg.baselines import critic, zero
-from jaxpg.batch import batch_fn
+from jaxpg.batch import make_batch_fn
 from jaxpg.estimators import gae, td_lambda
 from jaxpg.evaluation import evaluate
 from jaxpg.methods import Method, reinforce, td
@@ -217,7 +217,7 @@ def test_advantages_are_of_the_values_of_both_normalized_observations(limit):
     statistics = normalization.update(normalization.init(2), jnp.array([[1.0, 2.0], [4.0, -3.0]]))
     method, policy_fn = td(0.9, 5, gae(0.0)), sampling_policy(networks, params, statistics)
     _, steps = method.collect(vector, policy_fn, method.start(vector, new_key()), jax.random.key(1))
-    batch = batch_fn(networks, method, limit, 2.0, False)(params, statistics, steps)
+    batch = make_batch_fn(networks, method, limit, 2.0, False)(params, statistics, steps)
     value, next_value = (
         networks.value(params["critic"], normalization.normalize(statistics, x)) for x in (steps.obs, steps.next_obs)
     )

@@ -23,7 +23,7 @@ from jaxpg.actor_critic import actor_critic
 from jaxpg.estimators import gae
 from jaxpg.methods import td
 from jaxpg.networks import mlp_networks
-from jaxpg.shards import AXIS, sharded
+from jaxpg.shards import AXIS, shard
 from jaxpg.training import train_scan
 from jaxpg.vector_env import vectorize
 
@@ -158,7 +158,7 @@ def training(num_shards):
     batch, networks = vectorize(env, 32 // num_shards, 20), mlp_networks(env.observation_size, env.action_size, (8,))
     optimizer, axis_name = optax.adam(0.01), AXIS if several else None
     algorithm = actor_critic(batch, networks, optimizer, td(0.9, 5, gae(0.9)), axis_name=axis_name)
-    algorithm = sharded(algorithm, num_shards, jax.devices()) if several else algorithm
+    algorithm = shard(algorithm, num_shards, jax.devices()) if several else algorithm
     return jax.jit(lambda key: jax.tree.leaves(train_scan(algorithm, key, num_updates=20)[0].params))
 
 

@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 from envs.base import State
 from jaxpg.actor_critic import actor_critic
 from jaxpg.baselines import leave_one_out, of_returns
-from jaxpg.divergence import BOUND, diverged, lasting
+from jaxpg.divergence import BOUND, find_sound_steps, has_diverged
 from jaxpg.estimators import gae
 from jaxpg.features import polynomial
 from jaxpg.methods import reinforce, td
@@ -72,35 +72,35 @@ OUTSIDE = [1.1e10, -1.1e10, 1e38, np.inf, -np.inf, np.nan]
 @pytest.mark.parametrize("value", OUTSIDE)
 def test_numbers_beyond_the_bound_diverge(value):
     row = jnp.array([0.0, value])
-    assert diverged(AT_REST, AT_REST.replace(obs=row))
-    assert diverged(AT_REST, AT_REST.replace(reward=row[1]))
-    assert diverged(AT_REST, AT_REST.replace(pipeline_state=of_physics(qvel=row)))
-    assert diverged(AT_REST, AT_REST.replace(pipeline_state=of_physics(qpos=jnp.array([0.0, 0.0, value]))))
-    assert diverged(state(of_other()), state(of_other(position=value)))
-    assert diverged(AT_REST.replace(obs=row), AT_REST), "it was so after the reset"
+    assert has_diverged(AT_REST, AT_REST.replace(obs=row))
+    assert has_diverged(AT_REST, AT_REST.replace(reward=row[1]))
+    assert has_diverged(AT_REST, AT_REST.replace(pipeline_state=of_physics(qvel=row)))
+    assert has_diverged(AT_REST, AT_REST.replace(pipeline_state=of_physics(qpos=jnp.array([0.0, 0.0, value]))))
+    assert has_diverged(state(of_other()), state(of_other(position=value)))
+    assert has_diverged(AT_REST.replace(obs=row), AT_REST), "it was so after the reset"
 
 
 @pytest.mark.parametrize("value", [0.0, -BOUND, BOUND, 1e-38])
 def test_numbers_within_the_bound_do_not(value):
     row = jnp.array([0.0, value])
-    assert not diverged(AT_REST, AT_REST.replace(obs=row, reward=row[1], pipeline_state=of_physics(qvel=row)))
+    assert not has_diverged(AT_REST, AT_REST.replace(obs=row, reward=row[1], pipeline_state=of_physics(qvel=row)))
 
 
 @pytest.mark.parametrize("value", OUTSIDE)
 def test_constants_counters_keys_and_metrics_do_not_count(value):
     """What a model holds beside positions and velocities, what was so before the step, and what is only looked at."""
-    assert not diverged(AT_REST, AT_REST.replace(pipeline_state=of_physics(stiffness=value)))
-    assert not diverged(state(of_other(limit=value)), state(of_other(limit=value)))
-    assert not diverged(AT_REST, AT_REST.replace(metrics={"success": jnp.array(value)}))
+    assert not has_diverged(AT_REST, AT_REST.replace(pipeline_state=of_physics(stiffness=value)))
+    assert not has_diverged(state(of_other(limit=value)), state(of_other(limit=value)))
+    assert not has_diverged(AT_REST, AT_REST.replace(metrics={"success": jnp.array(value)}))
 
 
 @pytest.mark.parametrize("value", [np.inf, np.nan])
 def test_an_end_that_is_no_number_counts(value):
-    assert diverged(AT_REST, AT_REST.replace(done=jnp.array(value)))
+    assert has_diverged(AT_REST, AT_REST.replace(done=jnp.array(value)))
 
 
 def test_half_precision_overflows_at_its_own_bound():
-    assert diverged(AT_REST, AT_REST.replace(obs=2 * jnp.array([0.0, 60000.0], jnp.float16)))
+    assert has_diverged(AT_REST, AT_REST.replace(obs=2 * jnp.array([0.0, 60000.0], jnp.float16)))
 
 
 def test_a_bounded_observation_hides_nothing():
@@ -126,7 +126,7 @@ def test_lasting_is_the_loop(steps):
     for t in range(8):
         end = next((k for k in range(t, 8) if ended[k]), 7)
         expected.append(not bad[t : end + 1].any())
-    np.testing.assert_array_equal(lasting(jnp.array(bad), jnp.array(ended)), expected)
+    np.testing.assert_array_equal(find_sound_steps(jnp.array(bad), jnp.array(ended)), expected)
 
 
 # --- what is learned --------------------------------------------------------------------------------------------------

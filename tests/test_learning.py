@@ -10,7 +10,7 @@ import pytest
 from probes import Counter
 
 from jaxpg import normalization
-from jaxpg.batch import batch_fn
+from jaxpg.batch import make_batch_fn
 from jaxpg.estimators import gae
 from jaxpg.methods import td
 from jaxpg.networks import mlp_networks
@@ -26,7 +26,7 @@ def a_batch(params):
     method, vector, statistics = td(0.9, 5, gae(0.95)), vectorize(Counter(), 6, 10), normalization.init(2)
     policy_fn = sampling_policy(NETWORKS, params, statistics)
     _, steps = method.collect(vector, policy_fn, vector.reset(jax.random.key(0)), jax.random.key(1))
-    return batch_fn(NETWORKS, method, 10, 1.0, True)(params, statistics, steps)
+    return make_batch_fn(NETWORKS, method, 10, 1.0, True)(params, statistics, steps)
 
 
 @pytest.mark.parametrize("minibatches", [1, 2, 3])

@@ -11,7 +11,7 @@ from processes import LINES, RUN, outcome
 
 from envs.base import State
 from jaxpg.config.parsing import compose
-from jaxpg.nonfinite import quantities, skip_nonfinite, stop_at_nonfinite
+from jaxpg.nonfinite import list_quantities, skip_nonfinite, stop_at_nonfinite
 from jaxpg.program.algorithms import make_algorithm
 from jaxpg.program.compile import NAN_POLICIES
 from jaxpg.program.environment import make_env
@@ -67,7 +67,7 @@ def test_stop_stands_still_before_the_update(what, value):
     before, _ = train_scan(algorithm, KEY, BAD - 1)
     jax.tree.map(np.testing.assert_array_equal, state, before)
     assert state.update == BAD - 1
-    place = 1 + quantities(metrics).index(what)
+    place = 1 + list_quantities(metrics).index(what)
     assert metrics["nonfinite"].tolist() == [0] * (BAD - 1) + [place] * (8 - BAD)
     assert metrics["nonfinite_env"].tolist() == [-1] * (BAD - 1) + [1 if what == "observation" else -1] * (8 - BAD)
 
@@ -182,7 +182,7 @@ def test_a_reset_that_is_not_finite_is_an_observation():
         patch.setattr(algorithms, "vectorize", lambda env, *sizes: vectorize(Born("obs", 0.0), *sizes))
         algorithm = make_algorithm(config, Born("obs", 0.0))
         _, metrics = train_scan(stop_at_nonfinite(algorithm), KEY, 1)
-    assert quantities(metrics)[metrics["nonfinite"][0] - 1] == "observation"
+    assert list_quantities(metrics)[metrics["nonfinite"][0] - 1] == "observation"
     assert metrics["nonfinite_env"][0] == 0
 
 
@@ -219,7 +219,7 @@ def test_each_agent_is_named_once():
     metrics = {name: np.asarray(value) for name, value in METRICS.items()}
     for _ in range(2):
         monitor.observe(state, metrics)
-    names = quantities(METRICS)
+    names = list_quantities(METRICS)
     assert said == [
         f"note: update 12: {names[2]} is not finite, seed 7; such updates are skipped",
         f"note: update 11: {names[1]} is not finite, seed 8; such updates are skipped",

@@ -19,7 +19,7 @@ from jaxpg.estimators import gae, normalize_advantages
 from jaxpg.methods import td
 from jaxpg.nonfinite import stop_at_nonfinite
 from jaxpg.ppo import minibatch_steps, ppo, ppo_loss
-from jaxpg.shards import AXIS, in_parts, sharded
+from jaxpg.shards import AXIS, map_in_parts, shard
 from jaxpg.training import initial_state, train_scan
 from jaxpg.updates import actor_critic_loss, gradient_step
 from jaxpg.vector_env import episode_metrics, vectorize
@@ -62,9 +62,9 @@ def test_the_first_place_is_counted_through_all_parts(places):
     where = jnp.array(places)
     expected = places.index(True) if any(places) else -1
     parts = where.reshape(3, 2)
-    found = jax.vmap(lambda part: collectives.first_place(part, AXIS), axis_name=AXIS)(parts)
+    found = jax.vmap(lambda part: collectives.find_first(part, AXIS), axis_name=AXIS)(parts)
     np.testing.assert_array_equal(found, expected)
-    assert collectives.first_place(where, None) == expected
+    assert collectives.find_first(where, None) == expected
 
 
 def test_normalized_advantages_are_those_of_the_whole_batch():
@@ -128,7 +128,7 @@ def test_parts_on_devices_of_their_own_are_parts_on_one(name):
     assert len(jax.devices()) == 2
 
     def run(devices):
-        both = stop_at_nonfinite(sharded(algorithm(name, 6, AXIS), 2, devices))
+        both = stop_at_nonfinite(shard(algorithm(name, 6, AXIS), 2, devices))
         return jax.jit(lambda key: train_scan(both, key, 20))(jax.random.key(4))
 
     with jax.debug_key_reuse(False):  # see test_vmapped_seeds_are_single_seeds
@@ -143,7 +143,7 @@ def test_parts_on_devices_of_their_own_are_parts_on_one(name):
 
 
 def test_each_part_has_random_numbers_of_its_own():
-    both = sharded(algorithm(None, 6, AXIS), 2, jax.devices())
+    both = shard(algorithm(None, 6, AXIS), 2, jax.devices())
     state = jax.jit(lambda key: initial_state(both, key))(jax.random.key(0))
     first, second = np.split(np.asarray(state.env_state.obs), 2)
     assert not np.isin(first[:, 0], second[:, 0]).any()
@@ -153,7 +153,9 @@ def test_each_part_has_random_numbers_of_its_own():
 @pytest.mark.parametrize("devices", [1, 2])
 def test_rows_computed_in_parts_are_the_rows(devices):
     rows = jnp.arange(12.0).reshape(6, 2)
-    by_parts = jax.jit(in_parts(lambda factor, rows: {"sum": factor * rows.sum(axis=1)}, 2, jax.devices()[:devices]))
+    by_parts = jax.jit(
+        map_in_parts(lambda factor, rows: {"sum": factor * rows.sum(axis=1)}, 2, jax.devices()[:devices])
+    )
     np.testing.assert_array_equal(by_parts(3.0, rows)["sum"], 3 * rows.sum(axis=1))
 
 

@@ -11,7 +11,7 @@ import numpy as np
 from jaxpg import divergence
 from jaxpg.config.schema import Online
 from jaxpg.networks import Networks, linear_mean
-from jaxpg.online import Traces, learnable, trace_update
+from jaxpg.online import Traces, find_learnable_steps, trace_update
 from jaxpg.policy import sampling_policy
 from jaxpg.program.networks import make_networks
 from jaxpg.program.state import Policy
@@ -26,7 +26,7 @@ NUM_STEPS = 1000
 def collect_steps(stored: StoredPolicy) -> Transition:
     """Steps of one environment under the stochastic policy, `[T, 1, ...]`, T <= `NUM_STEPS`.
 
-    If training would not learn from a step (`jaxpg.online.learnable`), its episode is left out up to that step.
+    If training would ignore a step (`jaxpg.online.find_learnable_steps`), its episode is left out up to that step.
     """
     networks = make_networks(stored.config, stored.env)
     vector = vectorize(stored.env, 1, stored.config.env.episode_length)
@@ -38,8 +38,8 @@ def collect_steps(stored: StoredPolicy) -> Transition:
         return rollout(act, vector.step, vector.reset(key_reset), key_rollout, NUM_STEPS)[1]
 
     transition = play(stored.policy)
-    sound = learnable(transition, stored.policy.normalizer, stored.config.algo.normalize_observations)
-    is_learned = np.asarray(divergence.lasting(~sound, transition.ended))[:, 0]
+    sound = find_learnable_steps(transition, stored.policy.normalizer, stored.config.algo.normalize_observations)
+    is_learned = np.asarray(divergence.find_sound_steps(~sound, transition.ended))[:, 0]
     return jax.tree.map(lambda x: x[is_learned], transition)
 
 

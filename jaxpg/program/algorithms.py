@@ -111,7 +111,7 @@ def _make(make: Callable[..., Algorithm], config: Config, env: Any, method: Meth
         axis_name=shards.AXIS if number > 1 else None,
         **options,
     )
-    return shards.sharded(algorithm, number, jax.devices()) if number > 1 else algorithm
+    return shards.shard(algorithm, number, jax.devices()) if number > 1 else algorithm
 
 
 def make_optimizer(config: Config) -> optax.GradientTransformation:

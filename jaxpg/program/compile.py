@@ -118,7 +118,7 @@ def _of_one_agent(config: Config, env: Any, chunk: int) -> tuple[Callable, Calla
     def play(policy):
         starts = jax.random.split(jax.random.key(SELECTION_SEED), run.eval_episodes)
         parts = math.gcd(run.eval_episodes, config.num_shards)
-        return shards.in_parts(play_from, parts, jax.devices())(policy, starts)
+        return shards.map_in_parts(play_from, parts, jax.devices())(policy, starts)
 
     return init, advance, play
 

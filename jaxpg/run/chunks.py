@@ -9,7 +9,7 @@ import numpy as np
 
 from jaxpg.config.configuration import Config
 from jaxpg.divergence import BOUND
-from jaxpg.nonfinite import FLAGS, quantities
+from jaxpg.nonfinite import FLAGS, list_quantities
 from jaxpg.program.agents import described_agent
 from jaxpg.store.folder import to_json
 from jaxpg.types import Metrics, TrainState
@@ -108,7 +108,7 @@ class NonFiniteMonitor:
     def _report(self, agent: int, first_update: int, metrics: Metrics) -> None:
         codes = np.asarray(metrics["nonfinite"])[agent]
         at = int(np.argmax(codes > 0))
-        what = quantities(metrics)[codes[at] - 1]
+        what = list_quantities(metrics)[codes[at] - 1]
         environment = int(np.asarray(metrics["nonfinite_env"])[agent, at])
         where = f" of environment {environment}" if environment >= 0 else ""
         problem = f"update {first_update + at:,}: {what}{where} is not finite{self._describe_agent(agent)}"
