@@ -66,7 +66,7 @@ MISTAKES = {
     "sweep of another algorithm's option": (["algo=td", "sweep.algo.clip=[0.2]"], "unknown option 'sweep.algo.clip'"),
     "sweep of a size": (
         ["sweep.num_envs=[32,64]"],
-        "sweep.num_envs: num_envs cannot be swept, each of its values needs a run of its own",
+        "sweep.num_envs: num_envs cannot be swept; train a run for each value",
     ),
     "sweep of a count": (["sweep.algo.epochs=[1,2]"], "algo.epochs cannot be swept"),
     "sweep of a switch": (
@@ -83,11 +83,11 @@ MISTAKES = {
     "sweep of nothing": (["sweep.algo.gamma=[]"], "sweep.algo.gamma=[]: expected at least one value"),
     "sweep of a word": (["sweep.algo.gamma=[0.9,high]"], "sweep.algo.gamma=high: expected a number"),
     "sweep out of range": (["sweep.algo.gamma=[0.9,1.5]"], "sweep.algo.gamma=1.5: must be at least 0, at most 1"),
-    "sweep of a value twice": (["sweep.algo.gamma=[0.9,0.90]"], "sweep.algo.gamma=0.9: is in the list twice"),
+    "sweep of a value twice": (["sweep.algo.gamma=[0.9,0.90]"], "sweep.algo.gamma=0.9: appears twice in the list"),
     "sweep of null": (["algo=ppo", "sweep.algo.clip=[0.2,null]"], "sweep.algo.clip=null: null cannot be swept"),
     "swept and given": (
         ["algo.gamma=0.9", "sweep.algo.gamma=[0.9,0.95]"],
-        "algo.gamma is given and swept: leave out one of them",
+        "algo.gamma is both given and swept; leave one out",
     ),
     "unknown policy for what is not finite": (["nan_policy=ignore"], "must be stop or skip"),
     "fraction for a seed": (["seed=1.5"], "seed=1.5: expected a whole number"),
@@ -101,11 +101,11 @@ MISTAKES = {
     "environments beyond 32 bits": (["num_envs=1000000000000"], "must be at least 1, at most 2147483647"),
     "updates beyond 32 bits": (
         ["algo=td", "num_envs=2", "num_steps=1", "total_steps=1e12"],
-        "total_steps=1000000000000: with 2 steps an update it must stay below 4294967294",
+        "total_steps=1000000000000: with 2 steps per update it must stay below 4294967294",
     ),
     "gradient steps beyond 32 bits": (
         ["algo=ppo", "num_envs=512", "num_steps=30", "algo.epochs=10", "algo.minibatches=8", "total_steps=5e11"],
-        "total_steps=500000000000: with 15360 steps and 80 gradient steps an update it must stay below 412316851200",
+        "total_steps=500000000000: with 15360 steps and 80 gradient steps per update it must stay below 412316851200",
     ),
     "episodes beyond 32 bits": (["env.episode_length=3e9"], "env.episode_length=3000000000: it must stay below 2**31"),
     "rollouts beyond memory": (["num_envs=50000000"], "num_envs=50000000: such a training needs "),
@@ -121,7 +121,7 @@ MISTAKES = {
     "leave nobody": (["algo=reinforce", "algo.baseline=leave_one_out", "num_envs=1"], "num_envs must be at least 2"),
     "factors twice": (
         ["algo=reinforce", "algo.returns=whole", "algo.discounted=true"],
-        "algo.discounted=true: whole returns have the factors gamma^t in them",
+        "algo.discounted=true: whole returns already have the factors gamma^t",
     ),
     "no rewards to sum": (["algo.estimator=n_step", "algo.n=0"], "algo.n=0: must be at least 1"),
     "environments that do not divide": (

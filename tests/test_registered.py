@@ -54,7 +54,7 @@ TYPOS = {
 def test_mistakes_in_training_values_are_lines_that_name_the_entry(typo, monkeypatch):
     training, message = TYPOS[typo]
     (problem,) = problems_of(monkeypatch, training=training)
-    assert problem.startswith(f"env=odd, its training values: {message}")
+    assert problem.startswith(f"env=odd, training values: {message}")
 
 
 def test_all_mistakes_are_said_at_once(monkeypatch):

@@ -26,7 +26,7 @@ from jaxpg.config.parsing import compose, parse
 )
 def test_the_command_given_once_more_is_the_same_run(options):
     config = compose([*options, "run_dir=a folder, (with) odd=letters"])
-    program, arguments = shlex.split(repeat.command(config))[:3], shlex.split(repeat.command(config))[3:]
+    program, arguments = shlex.split(repeat.format_command(config))[:3], shlex.split(repeat.format_command(config))[3:]
     assert program[1:] == ["-m", "jaxpg.train"]
     again = compose(arguments)
     assert dataclasses.replace(again, run=dataclasses.replace(again.run, run_dir=config.run.run_dir)) == config
@@ -37,11 +37,11 @@ def test_the_command_given_once_more_is_the_same_run(options):
 
 @pytest.mark.parametrize("word", ["a b", "it's", "1e5", "null", "true", "[x]", "a,b", "x=y", "-", "${x}", "\u00e9", ""])
 def test_any_word_is_read_as_itself(word):
-    assert parse([repeat.argument("env.name", word)]) == {"env.name": word}
+    assert parse([repeat.format_argument("env.name", word)]) == {"env.name": word}
 
 
 def test_defaults_are_those_of_the_same_members():
     config = compose(["env=arm", "algo=td", "algo.gamma=0.5", "env.dt=0.1"])
-    defaults = repeat.defaults(config)
+    defaults = repeat.compose_defaults(config)
     assert (defaults["algo"], defaults["env.dt"]) == ("td", 0.05)
     assert defaults["algo.gamma"] == compose(["env=arm", "algo=td"]).algo.gamma != 0.5

@@ -10,7 +10,7 @@ import pytest
 import envs
 from envs.base import initial_state
 from envs.options import OptionError, option
-from jaxpg.config.conflicts import OF_OTHER_EPISODES
+from jaxpg.config.conflicts import EPISODE_MEANS
 from jaxpg.config.parsing import compose
 from jaxpg.estimators import normalize_advantages
 from jaxpg.program.algorithms import BASELINES, make_algorithm
@@ -106,4 +106,4 @@ def test_equal_advantages_become_nothing_and_no_noise(size, value):
 
 
 def test_baselines_that_need_others_are_all_known():
-    assert {*OF_OTHER_EPISODES, "none", "value"} == {*BASELINES}
+    assert {*EPISODE_MEANS, "none", "value"} == {*BASELINES}

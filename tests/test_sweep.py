@@ -7,7 +7,7 @@ import pytest
 from jaxpg.config.configuration import from_dict
 from jaxpg.config.entries import GROUPS
 from jaxpg.config.parsing import compose
-from jaxpg.config.sweep import settings, sweepable
+from jaxpg.config.sweep import find_sweepable_options, list_settings
 from jaxpg.program.agents import crossed, with_values
 from jaxpg.program.algorithms import make_algorithm
 from jaxpg.program.environment import make_env
@@ -31,7 +31,9 @@ def test_what_can_be_swept_has_an_effect(algo):
     def train(agent):
         return train_scan(make_algorithm(with_values(config, agent.values), env), jax.random.key(agent.seed), 2)[0]
 
-    defaults = {name: NUMBERS.get(name, field.default) for name, field in sweepable(config.choices).items()}
+    defaults = {
+        name: NUMBERS.get(name, field.default) for name, field in find_sweepable_options(config.choices).items()
+    }
     every = [defaults] + [defaults | {name: CHANGED.get(name, defaults[name] / 2)} for name in defaults]
     agents = crossed(every, seeds=[0])
     step = jax.jit(over_agents(train, 1))
@@ -43,7 +45,7 @@ def test_what_can_be_swept_has_an_effect(algo):
 
 def test_counts_names_and_switches_are_part_of_the_program():
     """And nothing of the environment or the run can be swept."""
-    found = sweepable({"env": "pendulum", "algo": "ppo", "network": "mlp"})
+    found = find_sweepable_options({"env": "pendulum", "algo": "ppo", "network": "mlp"})
     assert {"algo.gamma", "algo.clip", "network.sigma"} <= set(found)
     assert {name.partition(".")[0] for name in found} == {"algo", "network"}
     assert all(field.type in ("float", "float | None") for field in found.values())
@@ -51,10 +53,10 @@ def test_counts_names_and_switches_are_part_of_the_program():
 
 def test_settings_are_all_combinations():
     config = compose(["sweep.algo.actor_lr=[0.1,0.2,0.3]", "sweep.algo.gamma=[0,1]"])
-    found = settings(config.sweep)
+    found = list_settings(config.sweep)
     assert len(found) == len({tuple(setting.items()) for setting in found}) == 6
     assert found[1] == {"algo.actor_lr": 0.1, "algo.gamma": 1.0}
-    assert settings({}) == [{}]
+    assert list_settings({}) == [{}]
 
 
 def test_a_configuration_keeps_its_sweep():

@@ -8,7 +8,7 @@ from typing import Any
 
 from envs.options import build
 from jaxpg.config import parsing
-from jaxpg.config.help import command_help
+from jaxpg.config.help import format_command_help
 from jaxpg.errors import UserError
 
 
@@ -23,7 +23,7 @@ def print_help_if_asked(command: str, what: str, schema: type, arguments: Sequen
     """
     is_asked = bool({"--help", "-h"} & set(arguments))
     if is_asked:
-        print(command_help(command, what, schema))
+        print(format_command_help(command, what, schema))
     return is_asked
 
 

@@ -12,7 +12,7 @@ from jaxpg.config import help, parsing
 def main(arguments: Sequence[str]) -> int:
     """The training command; returns its exit status."""
     if {"--help", "-h"} & set(arguments):
-        print(help.train_help([argument for argument in arguments if not argument.startswith("-")]))
+        print(help.format_train_help([argument for argument in arguments if not argument.startswith("-")]))
         return 0
     from jaxpg.run import session
     from jaxpg.watch.closing import show_results

@@ -1,4 +1,4 @@
-"""What can be chosen by name: algorithms, networks and environments, with their options."""
+"""Algorithms, networks and environments that can be chosen by name, with their options."""
 
 from __future__ import annotations
 
@@ -12,20 +12,20 @@ from jaxpg.config import schema
 
 
 class Entry(NamedTuple):
-    """What can be chosen by name: its options, and the function that makes it of them.
+    """An algorithm or network that can be chosen by name.
 
     Attributes:
       options: dataclass of its options.
-      build: the function, or where it is, "module:name": it is imported at its first use, so that options are read
-        without the programs. Of an algorithm `build(config, env) -> Algorithm`, of networks
+      build: the function that builds it, or its place "module:name", which is imported on first use so that options can
+        be read without the programs. For algorithms `build(config, env) -> Algorithm`, for networks
         `build(options, observation_size, action_size) -> Networks`.
     """
 
     options: type
     build: Callable[..., Any] | str
 
-    def built(self, *arguments: Any) -> Any:
-        """What `build` makes of the arguments."""
+    def make(self, *arguments: Any) -> Any:
+        """Calls `build`, importing it if necessary."""
         if callable(self.build):
             return self.build(*arguments)
         module, _, name = self.build.partition(":")
@@ -33,11 +33,11 @@ class Entry(NamedTuple):
 
 
 class Options(Mapping[str, type]):
-    """The options of every entry by its name, of those too that are added later.
+    """A view of the options of each entry, by name, that includes entries added later.
 
     Args:
-      entries: gives them by name.
-      attribute: of an entry, which holds its options.
+      entries: returns the entries by name.
+      attribute: the attribute of an entry with its options.
     """
 
     def __init__(self, entries: Callable[[], Mapping[str, Any]], attribute: str):
@@ -70,8 +70,8 @@ GROUPS: dict[str, Mapping[str, type]] = {
 }
 
 
-def option_fields(choices: Mapping[str, str]) -> dict[str, dataclasses.Field]:
-    """Every option under these choices, by its name on the command line."""
+def find_option_fields(choices: Mapping[str, str]) -> dict[str, dataclasses.Field]:
+    """The field of every option under these choices, by its name on the command line."""
     fields = {field.name: field for field in dataclasses.fields(schema.Run)}
     for group, choice in choices.items():
         fields |= {f"{group}.{field.name}": field for field in dataclasses.fields(GROUPS[group][choice])}

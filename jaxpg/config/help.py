@@ -1,4 +1,4 @@
-"""The help of the commands, made from the options themselves."""
+"""The help of the commands, made from their options."""
 
 from __future__ import annotations
 
@@ -9,21 +9,21 @@ from typing import Any
 
 from envs.options import describe
 from jaxpg.config.configuration import flatten
-from jaxpg.config.entries import GROUPS, option_fields
+from jaxpg.config.entries import GROUPS, find_option_fields
 from jaxpg.config.parsing import compose
 from jaxpg.config.schema import Run
-from jaxpg.config.sweep import sweepable
+from jaxpg.config.sweep import find_sweepable_options
 
 SWEEP = (
-    "sweep.NAME=[VALUE,VALUE,...] trains agents with each value of the option NAME, all in one program; with several "
-    "NAMEs all combinations of their values. NAME is one of"
+    "sweep.NAME=[VALUE,VALUE,...] trains agents with each value of the option NAME, all in one program; several sweeps "
+    "give all combinations of their values. NAME is one of"
 )
 
 
-def train_help(arguments: Sequence[str]) -> str:
-    """Every option with its default for the chosen environment and algorithm, its range and its meaning."""
+def format_train_help(arguments: Sequence[str]) -> str:
+    """All options of a training, with their defaults for the chosen environment and algorithm, ranges and help."""
     config = compose(arguments)
-    values, fields = flatten(config), option_fields(config.choices)
+    values, fields = flatten(config), find_option_fields(config.choices)
     lines = [
         "usage: python -m jaxpg.train [group=member] [option=value] ...",
         "       python -m jaxpg.train resume=DIR [total_steps=N]",
@@ -34,21 +34,25 @@ def train_help(arguments: Sequence[str]) -> str:
     for group in ("", *GROUPS):
         schema = GROUPS[group][config.choices[group]] if group else Run
         names = [name for name in fields if name.rpartition(".")[0] == group]
-        lines += ["", schema.__doc__.splitlines()[0], *(_line(name, values[name], fields[name]) for name in names)]
-    names = ", ".join(sweepable(config.choices))
+        lines += [
+            "",
+            schema.__doc__.splitlines()[0],
+            *(_format_line(name, values[name], fields[name]) for name in names),
+        ]
+    names = ", ".join(find_sweepable_options(config.choices))
     lines += ["", *textwrap.wrap(f"{SWEEP} {names}.", width=120)]
-    lines += ["", "Shown are the defaults for the environment and the algorithm named above; add env=... or algo=..."]
+    lines += ["", "The defaults are those of the environment and algorithm above; for others, add env=... or algo=..."]
     return "\n".join(lines)
 
 
-def command_help(command: str, what: str, schema: type) -> str:
-    """Every option of a command about `what`, such as `run=DIR`."""
+def format_command_help(command: str, what: str, schema: type) -> str:
+    """All options of a command; `what` is its subject, such as `run=DIR`."""
     lines = [f"usage: python -m jaxpg.{command} {what} [option=value] ...", "", schema.__doc__]
-    return "\n".join(lines + [_line(field.name, field.default, field) for field in dataclasses.fields(schema)])
+    return "\n".join(lines + [_format_line(field.name, field.default, field) for field in dataclasses.fields(schema)])
 
 
-def _line(name: str, value: Any, field: dataclasses.Field) -> str:
-    shown = "" if value is None else str(value).replace(" ", "")
+def _format_line(name: str, value: Any, field: dataclasses.Field) -> str:
+    text = "" if value is None else str(value).replace(" ", "")
     if isinstance(value, bool):
-        shown = shown.lower()
-    return f"  {name}={shown}".ljust(38) + describe(field)
+        text = text.lower()
+    return f"  {name}={text}".ljust(38) + describe(field)

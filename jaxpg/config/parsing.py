@@ -1,6 +1,6 @@
 """The command line: `env=arm algo=td algo.lambda_=0.9 seed=3`.
 
-Values that nobody gave come from the environment's registry entry, which keeps what was tuned on it, and else from the
+Values that are not given come from the environment's registry entry, which has tuned values, or else from the
 dataclasses.
 """
 
@@ -14,107 +14,114 @@ from typing import Any
 import yaml
 
 from jaxpg.config import plain_yaml, registered
-from jaxpg.config.configuration import Config, check_choices, divide, from_dict, members, unknown_names
-from jaxpg.config.conflicts import nearest_divisor
-from jaxpg.config.entries import GROUPS, option_fields
+from jaxpg.config.configuration import (
+    Config,
+    check_choices,
+    describe_unknown_names,
+    from_dict,
+    select_choices,
+    split_sweep,
+)
+from jaxpg.config.conflicts import find_nearest_divisor
+from jaxpg.config.entries import GROUPS, find_option_fields
 from jaxpg.config.schema import LARGEST, Gaussian, Run
 from jaxpg.errors import UserError
 
-DEFAULT_CHOICES = {"env": "pendulum", "algo": "td", "network": "mlp"}  # algo: the first that the environment has tuned
+DEFAULT_CHOICES = {"env": "pendulum", "algo": "td", "network": "mlp"}  # algo: the environment's first tuned one
 NAME = re.compile(r"[A-Za-z_][A-Za-z0-9_]*(\.[A-Za-z_][A-Za-z0-9_]*)*")
 FOLDERS = ("run_dir", "resume", "run", "out")  # options whose value is a path
 
 
 def compose(arguments: Sequence[str]) -> Config:
-    """The configuration that a command line asks for.
+    """The configuration for a command line.
 
     Args:
-      arguments: `name=value`.
+      arguments: texts `name=value`.
 
     Raises:
-      OptionError, UserError: every unknown name, wrong type and value out of range, of the command line or of the
-        environment's training values; or text that is no `name=value`.
+      OptionError, UserError: lists every unknown name, wrong type and value out of range, on the command line or in the
+        environment's training values; or an argument is not `name=value`.
     """
     given = parse(arguments)
-    check_choices(members(given))
-    tuned = _fitting(_tuned(members(given)), given)
-    choices = DEFAULT_CHOICES | members(tuned) | members(given)
+    check_choices(select_choices(given))
+    tuned = _fit_divisors(_read_tuned_values(select_choices(given)), given)
+    choices = DEFAULT_CHOICES | select_choices(tuned) | select_choices(given)
     check_choices(choices)
-    swept, plain = divide(given)
-    problems = unknown_names(plain, choices)
-    problems += [f"{name} is given and swept: leave out one of them" for name in plain if name in swept]
-    values = {name: value for name, value in tuned.items() if name in _tunable(tuned, choices)} | plain
-    return from_dict({**_with_defaults(choices, values), "sweep": swept}, problems)
+    swept, plain = split_sweep(given)
+    problems = describe_unknown_names(plain, choices)
+    problems += [f"{name} is both given and swept; leave one out" for name in plain if name in swept]
+    values = {name: value for name, value in tuned.items() if name in _find_tunable_options(tuned, choices)} | plain
+    return from_dict({**_add_defaults(choices, values), "sweep": swept}, problems)
 
 
-def _tuned(chosen: Mapping[str, Any]) -> Mapping[str, Any]:
-    """What the environment's registry entry says: its algorithm where none was chosen, and that one's values."""
+def _read_tuned_values(chosen: Mapping[str, Any]) -> Mapping[str, Any]:
+    """The algorithm, by default the environment's first tuned one, and the environment's values for it."""
     name = chosen.get("env", DEFAULT_CHOICES["env"])
-    training = registered.training_values(name)
+    training = registered.read_training_values(name)
     algo = chosen.get("algo", next(iter(training), DEFAULT_CHOICES["algo"]))
     return {"algo": algo, **training.get(algo, {})}
 
 
-def _tunable(tuned: Mapping[str, Any], choices: Mapping[str, str]) -> set[str]:
-    """The options whose tuned values count: those of another network than the chosen one say nothing of it."""
-    known = set(option_fields(choices))
+def _find_tunable_options(tuned: Mapping[str, Any], choices: Mapping[str, str]) -> set[str]:
+    """The options whose tuned values apply; values tuned for another network than the chosen one do not."""
+    known = set(find_option_fields(choices))
     if choices["network"] == tuned.get("network", DEFAULT_CHOICES["network"]):
         return known
-    own = {field.name for field in dataclasses.fields(GROUPS["network"][choices["network"]])}
-    return known - {f"network.{name}" for name in own - {field.name for field in dataclasses.fields(Gaussian)}}
+    names = {field.name for field in dataclasses.fields(GROUPS["network"][choices["network"]])}
+    return known - {f"network.{name}" for name in names - {field.name for field in dataclasses.fields(Gaussian)}}
 
 
-def _fitting(tuned: Mapping[str, Any], given: Mapping[str, Any]) -> Mapping[str, Any]:
-    """The tuned values with numbers of shards, and of minibatches of each, that divide the environments asked for."""
-    left, fitting = given.get("num_envs", tuned.get("num_envs")), {}
-    if not isinstance(left, int) or not 1 <= left <= LARGEST:
+def _fit_divisors(tuned: Mapping[str, Any], given: Mapping[str, Any]) -> Mapping[str, Any]:
+    """Adjusts the tuned numbers of shards and minibatches so that they divide the number of environments."""
+    num_envs, adjusted = given.get("num_envs", tuned.get("num_envs")), {}
+    if not isinstance(num_envs, int) or not 1 <= num_envs <= LARGEST:
         return tuned
     divisors = ("algo.num_shards", "algo.minibatches")
     for name in divisors:
-        if isinstance(given.get(name), int) and given[name] in range(1, left + 1):
-            left //= given[name]  # where it does not divide them, that is a conflict of what was asked for
+        if isinstance(given.get(name), int) and given[name] in range(1, num_envs + 1):
+            num_envs //= given[name]  # if it does not divide them, the given options conflict
     for name in divisors:
         if name in tuned and name not in given:
-            fitting[name] = nearest_divisor(left, tuned[name])
-            left //= fitting[name]
-    return {**tuned, **fitting}
+            adjusted[name] = find_nearest_divisor(num_envs, tuned[name])
+            num_envs //= adjusted[name]
+    return {**tuned, **adjusted}
 
 
 def parse(arguments: Sequence[str]) -> dict[str, Any]:
     """`name=value` arguments as plain values: numbers, true, false, null, text, and lists of these.
 
-    A value is read as `config.yaml` would read it; a path stands as it is.
+    A value is read as in `config.yaml`; a path is taken literally.
 
     Raises:
-      UserError: an argument is not of that form, or a name is given twice.
+      UserError: an argument does not have this form, or a name is given twice.
     """
     given = {}
     for argument in arguments:
         name, equals, text = argument.partition("=")
         if not (equals and NAME.fullmatch(name)):
-            raise _not_an_assignment(argument)
+            raise _make_syntax_error(argument)
         if name in given:
             raise UserError(f"{name} is given twice")
-        given[name] = text if name in FOLDERS and text else _value(text, argument)
+        given[name] = text if name in FOLDERS and text else _parse_value(text, argument)
     return given
 
 
-def _value(text: str, argument: str) -> Any:
+def _parse_value(text: str, argument: str) -> Any:
     try:
         return plain_yaml.load_value(text) if text else text
     except yaml.YAMLError:
-        raise _not_an_assignment(argument) from None
+        raise _make_syntax_error(argument) from None
 
 
-def _not_an_assignment(argument: str) -> UserError:
+def _make_syntax_error(argument: str) -> UserError:
     return UserError(f"'{argument}': expected name=value, such as seed=3; see --help")
 
 
-def _with_defaults(choices: Mapping[str, str], values: Mapping[str, Any]) -> dict[str, Any]:
-    """The groups' members and the run's own options with their defaults, but for the values given, nested."""
-    members = {group: {"id": name, **dataclasses.asdict(GROUPS[group][name]())} for group, name in choices.items()}
-    nested = {**dataclasses.asdict(Run()), **members}
-    for name in option_fields(choices).keys() & values.keys():
+def _add_defaults(choices: Mapping[str, str], values: Mapping[str, Any]) -> dict[str, Any]:
+    """The options of the run and of the chosen members, nested, with defaults where no value is given."""
+    groups = {group: {"id": name, **dataclasses.asdict(GROUPS[group][name]())} for group, name in choices.items()}
+    nested = {**dataclasses.asdict(Run()), **groups}
+    for name in find_option_fields(choices).keys() & values.keys():
         group, _, leaf = name.rpartition(".")
         (nested[group] if group else nested)[leaf] = values[name]
     return nested

@@ -1,6 +1,6 @@
 """Plain values as YAML 1.2: null, true, false, numbers, text, and lists and mappings of these.
 
-PyYAML follows YAML 1.1, in which 1e-3 is a text, 1:30 the number 90, `no` is false and 2026-01-01 a date.
+PyYAML follows YAML 1.1, in which 1e-3 is a text, 1:30 is the number 90, `no` is false and 2026-01-01 is a date.
 """
 
 from __future__ import annotations
@@ -10,7 +10,7 @@ from typing import Any, ClassVar
 
 import yaml
 
-# YAML 1.2.2, section 10.3.2, and `_` between the digits of numbers.
+# As in YAML 1.2.2, section 10.3.2, but also with `_` between digits.
 RESOLVERS = {
     "null": (r"null|Null|NULL|~|", ["", *"nN~"]),
     "bool": (r"true|True|TRUE|false|False|FALSE", [*"tTfF"]),
@@ -24,7 +24,7 @@ RESOLVERS = {
 
 
 class Loader(yaml.SafeLoader):
-    """Safe; a name that is there twice is refused."""
+    """A safe loader that refuses duplicate names."""
 
     yaml_implicit_resolvers: ClassVar[dict] = {}
 
@@ -32,12 +32,12 @@ class Loader(yaml.SafeLoader):
         keys = [self.construct_object(key, deep=True) for key, _ in node.value]
         for key in keys:
             if keys.count(key) > 1:
-                raise yaml.constructor.ConstructorError(None, None, f"{key} is there twice", node.start_mark)
+                raise yaml.constructor.ConstructorError(None, None, f"{key} appears twice", node.start_mark)
         return super().construct_mapping(node, deep)
 
 
 class Dumper(yaml.SafeDumper):
-    """Quotes a text that `Loader` would read as something else."""
+    """A dumper that quotes every text that `Loader` would read as something else."""
 
     yaml_implicit_resolvers: ClassVar[dict] = {}
 
@@ -63,12 +63,12 @@ def dump(values: dict[str, Any]) -> str:
 
 
 def load(text: str) -> Any:
-    """What the text says; raises yaml.YAMLError if it is no YAML."""
+    """The values in a text; raises yaml.YAMLError if it is not YAML."""
     return yaml.load(text, Loader)
 
 
 def load_value(text: str) -> Any:
-    """One value: a list, mapping or quoted text as in YAML, and else a number, true, false, null or the text as it is.
+    """One value: a list, mapping or quoted text as in YAML, else a number, true, false, null or the text itself.
 
     >>> load_value("[1e-3, a]"), load_value("null"), load_value("@a: #b"), load_value("'3'")
     ([0.001, 'a'], None, '@a: #b', '3')

@@ -1,4 +1,4 @@
-"""What the registry's entries say to a training, and which program has entered them."""
+"""Training values of registered environments, and the programs that registered them."""
 
 from __future__ import annotations
 
@@ -15,30 +15,30 @@ from envs.options import OptionError, build, describe_unknown
 from jaxpg.config.entries import GROUPS
 from jaxpg.config.schema import Run
 
-PROGRAM = "program"  # in config.yaml: what registered the environment
+PROGRAM = "program"  # key in config.yaml: the program that registered the environment
 
 
-def training_values(name: str) -> Mapping[str, Mapping[str, Any]]:
+def read_training_values(name: str) -> Mapping[str, Mapping[str, Any]]:
     """The training values of the environment `name`, by algorithm.
 
-    All of them are checked, so that a mistake does not wait for its algorithm. A value may be an option of any
-    algorithm or network, since several often share theirs; one that the chosen ones do not have counts for nothing.
+    Values of all algorithms are checked, so that a mistake shows early. A value may belong to any algorithm or network,
+    since these often share options; it is ignored if the chosen ones lack the option.
 
     Raises:
-      OptionError: a line for each that is no option (with the nearest name), or of a wrong type or out of range.
+      OptionError: lists every unknown option (with the nearest name), wrong type and value out of range.
     """
     training = envs.find(name).training
-    problems = [f"env={name}, its training values: {problem}" for problem in _problems(name, training)]
+    problems = [f"env={name}, training values: {problem}" for problem in _find_problems(name, training)]
     if problems:
         raise OptionError(problems)
     return training
 
 
-def _problems(name: str, training: Any) -> Iterator[str]:
+def _find_problems(name: str, training: Any) -> Iterator[str]:
     if not isinstance(training, Mapping):
         yield f"expected values by algorithm, such as {{'td': {{'num_envs': 64}}}}, not {training!r}"
         return
-    schemas = _schemas(name)
+    schemas = _collect_schemas(name)
     for algo, values in training.items():
         if algo not in GROUPS["algo"]:
             yield describe_unknown("algo", str(algo), GROUPS["algo"])
@@ -46,21 +46,21 @@ def _problems(name: str, training: Any) -> Iterator[str]:
             yield f"{algo}: expected values by option, such as {{'num_envs': 64}}, not {values!r}"
         else:
             for option, value in values.items():
-                yield from (f"{algo}: {problem}" for problem in _problems_of_value(algo, option, value, schemas))
+                yield from (f"{algo}: {problem}" for problem in _find_value_problems(algo, option, value, schemas))
 
 
-def _schemas(env: str) -> dict[str, dict[str, type]]:
-    """Option -> where it may come from: the member of its group -> that member's schema."""
+def _collect_schemas(env: str) -> dict[str, dict[str, type]]:
+    """Option -> members of its group that have it -> their schemas."""
     groups = {"": {"": Run}, "env": {env: envs.find(env).config}, "algo": GROUPS["algo"], "network": GROUPS["network"]}
-    found: dict[str, dict[str, type]] = {}
+    schemas: dict[str, dict[str, type]] = {}
     for group, members in groups.items():
         for member, schema in members.items():
             for field in dataclasses.fields(schema):
-                found.setdefault(f"{group}.{field.name}".lstrip("."), {})[member] = schema
-    return found
+                schemas.setdefault(f"{group}.{field.name}".lstrip("."), {})[member] = schema
+    return schemas
 
 
-def _problems_of_value(algo: str, name: Any, value: Any, schemas: Mapping[str, Mapping[str, type]]) -> Iterator[str]:
+def _find_value_problems(algo: str, name: Any, value: Any, schemas: Mapping[str, Mapping[str, type]]) -> Iterator[str]:
     if name == "network":
         if value not in GROUPS["network"]:
             yield describe_unknown("network", str(value), GROUPS["network"])
@@ -75,8 +75,8 @@ def _problems_of_value(algo: str, name: Any, value: Any, schemas: Mapping[str, M
             yield from error.problems
 
 
-def program_of(env: str) -> dict[str, str]:
-    """What goes into config.yaml of the program that registered an environment of somebody's own, and is running."""
+def find_program(env: str) -> dict[str, str]:
+    """The entry for config.yaml: the running program, if it registered the environment; else empty."""
     main = sys.modules["__main__"]
     module, path = getattr(main, "__spec__", None), getattr(main, "__file__", None)
     if env in envs.SHIPPED or not (module or path):
@@ -84,22 +84,23 @@ def program_of(env: str) -> dict[str, str]:
     return {PROGRAM: f"-m {module.name}" if module else os.path.abspath(path)}
 
 
-def command(env: str, verb: str) -> str:
-    """How a command about a run of this environment begins, such as `python -m jaxpg.evaluate`."""
-    program = program_of(env)
-    return _command(program[PROGRAM], verb) if program else f"{python_command()} -m jaxpg.{verb}"
+def format_command(env: str, verb: str) -> str:
+    """The start of a command about a run of this environment, such as `python -m jaxpg.evaluate`."""
+    program = find_program(env)
+    return _format_program_command(program[PROGRAM], verb) if program else f"{python_command()} -m jaxpg.{verb}"
 
 
-def _command(program: str, verb: str) -> str:
+def _format_program_command(program: str, verb: str) -> str:
     return f"{python_command()} {program if program.startswith('-m ') else shlex.quote(program)} {verb}"
 
 
-def check_known(env: str, program: str | None) -> None:
-    """Raises OptionError where no environment has the name, with the program that registers it, if that is known."""
+def check_registered(env: str, program: str | None) -> None:
+    """Raises OptionError if no environment has this name; it names the program that registers it, if known."""
     if env in envs.REGISTRY:
         return
     problem = describe_unknown("env", env, envs.REGISTRY).removesuffix("?")
     if program is not None:
         problem = f"unknown env '{env}': {program} registers it"
-    instead = f"instead of {python_command()} -m jaxpg.COMMAND say {_command(program or 'SCRIPT', 'COMMAND')}"
-    raise OptionError([f"{problem}; {instead}" + ("" if program else ", with the script that registers it")])
+    command = _format_program_command(program or "SCRIPT", "COMMAND")
+    advice = f"use {command} instead of {python_command()} -m jaxpg.COMMAND"
+    raise OptionError([f"{problem}; {advice}" + ("" if program else ", where SCRIPT registers it")])

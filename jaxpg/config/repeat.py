@@ -1,4 +1,4 @@
-"""The command that makes a run once more, and what it says that the defaults do not."""
+"""The command that repeats a run, with every option that differs from its default."""
 
 from __future__ import annotations
 
@@ -11,72 +11,73 @@ from typing import Any
 from jaxpg.config import configuration, parsing, registered
 from jaxpg.config.configuration import Config
 
-NOT_REPEATED = ("run_dir",)  # its folder is not empty any more
-NO_WORDS = ("null", "true", "false", "inf", "nan")  # but values
-MOST = 5  # rounds until a command is complete: an option can change the default of another
+NOT_REPEATED = ("run_dir",)  # the folder exists by now
+YAML_VALUES = ("null", "true", "false", "inf", "nan")  # words that must be quoted as text
+MAX_ROUNDS = 5  # in which a command is completed, as an option can change the default of another
 
 
-def defaults(config: Config) -> dict[str, Any]:
-    """The options of a run with the same members of the groups and nothing else given, by their names."""
-    return configuration.named(_composed(dict(config.choices)))
+def compose_defaults(config: Config) -> dict[str, Any]:
+    """The default values of all options under the same choices, by name."""
+    return configuration.to_arguments(_compose(dict(config.choices)))
 
 
-def command(config: Config) -> str:
-    """The command line that trains the same: the environment, and every option that is not its default then.
+def format_command(config: Config) -> str:
+    """The command line that repeats the training: the environment, and every option that differs from its default.
 
     Raises:
-      RuntimeError: none was found, as when the defaults of the environment are others by now.
+      RuntimeError: no command line was found, as when the environment's defaults have changed.
     """
     given = {"env": config.choices["env"]}
-    for _ in range(MOST):
-        missing = _differences(config, _composed(given))
+    for _ in range(MAX_ROUNDS):
+        missing = _find_differences(config, _compose(given))
         if not missing:
-            return " ".join([_program(config), *(shlex.quote(argument(*option)) for option in given.items())])
+            arguments = (shlex.quote(format_argument(name, value)) for name, value in given.items())
+            return " ".join([_format_program(config), *arguments])
         given |= missing
     raise RuntimeError(f"no command line for {given}")
 
 
-def _differences(config: Config, other: Config) -> dict[str, Any]:
-    """The options of `config` that `other` has not, groups before what is in them."""
-    wanted, found = configuration.named(config), configuration.named(other)
+def _find_differences(config: Config, other: Config) -> dict[str, Any]:
+    """The values of `config` that differ in `other`; choices of groups before their options."""
+    values, others = configuration.to_arguments(config), configuration.to_arguments(other)
     groups = {name: choice for name, choice in config.choices.items() if other.choices[name] != choice}
     return groups or {
         name: value
-        for name, value in wanted.items()
-        if name not in NOT_REPEATED and (name not in found or found[name] != value)
+        for name, value in values.items()
+        if name not in NOT_REPEATED and (name not in others or others[name] != value)
     }
 
 
-def _composed(given: Mapping[str, Any]) -> Config:
-    return parsing.compose([argument(name, value) for name, value in given.items()])
+def _compose(given: Mapping[str, Any]) -> Config:
+    return parsing.compose([format_argument(name, value) for name, value in given.items()])
 
 
-def _program(config: Config) -> str:
-    """As anybody would type it: pages are sent to others, who have another interpreter."""
-    program = registered.program_of(config.choices["env"]).get(registered.PROGRAM)
+def _format_program(config: Config) -> str:
+    """The start of the command, without this machine's interpreter, as pages are sent to others."""
+    program = registered.find_program(config.choices["env"]).get(registered.PROGRAM)
     if program is None:
         return "python -m jaxpg.train"
     return f"python {program if program.startswith('-m ') else shlex.quote(program)} train"
 
 
-def argument(name: str, value: Any) -> str:
-    """An option as it is given on the command line.
+def format_argument(name: str, value: Any) -> str:
+    """An option as on the command line.
 
-    >>> argument("network.widths", [64, 32]), argument("stop_return", None), argument("report", False)
-    ('network.widths=[64,32]', 'stop_return=null', 'report=false')
+    >>> format_argument("network.widths", [64, 32]), format_argument("stop_return", None)
+    ('network.widths=[64,32]', 'stop_return=null')
     """
-    return f"{name}={_text(value)}"
+    return f"{name}={_format_value(value)}"
 
 
-def _text(value: Any) -> str:
+def _format_value(value: Any) -> str:
     if isinstance(value, (list, tuple)):
-        return "[" + ",".join(map(_text, value)) + "]"
+        return "[" + ",".join(map(_format_value, value)) + "]"
     if value is None or isinstance(value, bool):
         return {None: "null", True: "true", False: "false"}[value]
-    return _quoted(value) if isinstance(value, str) else str(value)
+    return _quote(value) if isinstance(value, str) else str(value)
 
 
-def _quoted(word: str) -> str:
-    """A word that the command line reads as itself, in quotes if it has to be."""
-    plain = re.fullmatch(r"[A-Za-z][A-Za-z0-9_]*", word) and word.lower() not in NO_WORDS
+def _quote(word: str) -> str:
+    """The word, in quotes if the command line would not read it as itself."""
+    plain = re.fullmatch(r"[A-Za-z][A-Za-z0-9_]*", word) and word.lower() not in YAML_VALUES
     return word if plain else json.dumps(word, ensure_ascii=False)

@@ -10,7 +10,7 @@ import numpy as np
 
 from jaxpg.config import sweep
 from jaxpg.config.configuration import Config
-from jaxpg.config.sweep import Setting, settings
+from jaxpg.config.sweep import Setting, list_settings
 
 
 class Agents(NamedTuple):
@@ -27,7 +27,7 @@ class Agents(NamedTuple):
 
 def agents_of(config: Config) -> Agents:
     """The agents of a run: the seeds seed, seed + 1, ... of the first setting, then those of the second, ..."""
-    return crossed(settings(config.sweep), range(config.run.seed, config.run.seed + config.run.num_seeds))
+    return crossed(list_settings(config.sweep), range(config.run.seed, config.run.seed + config.run.num_seeds))
 
 
 def crossed(settings: Sequence[Setting], seeds: Sequence[int]) -> Agents:
@@ -55,7 +55,7 @@ def with_values(config: Config, values: Mapping[str, Any]) -> Config:
 
 def setting_of(config: Config, agent: int) -> Setting:
     """The setting of one agent, counted from 0 as in `agents_of`."""
-    return settings(config.sweep)[agent // config.run.num_seeds]
+    return list_settings(config.sweep)[agent // config.run.num_seeds]
 
 
 def alone(config: Config, agent: int) -> Config:
@@ -67,12 +67,12 @@ def alone(config: Config, agent: int) -> Config:
 
 def described_agent(config: Config, agent: int) -> str:
     """One agent in words, such as `seed 3 algo.gamma=0.9`."""
-    return f"seed {alone(config, agent).run.seed} {sweep.described(setting_of(config, agent))}".strip()
+    return f"seed {alone(config, agent).run.seed} {sweep.format_setting(setting_of(config, agent))}".strip()
 
 
 def described(config: Config) -> str:
     """The run and its agents in words, such as `td on pendulum, 6 settings x seeds 0 to 3`."""
-    run, number = config.run, len(settings(config.sweep))
+    run, number = config.run, len(list_settings(config.sweep))
     seeds = f"seeds {run.seed} to {run.seed + run.num_seeds - 1}" if run.num_seeds > 1 else f"seed {run.seed}"
     agents = f"{number} settings x {seeds}" if config.sweep else seeds
     return f"{config.choices['algo']} on {config.task}, {agents}"

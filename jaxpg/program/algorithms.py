@@ -49,7 +49,7 @@ RETURNS = {"to_go": estimators.reinforce, "whole": estimators.reinforce_whole}
 
 def make_algorithm(config: Config, env: Any) -> Algorithm:
     """One agent's algorithm, as pure functions."""
-    algorithm = ALGORITHMS[config.choices["algo"]].built(config, env)
+    algorithm = ALGORITHMS[config.choices["algo"]].make(config, env)
     return with_sigma(algorithm, log_sigma(config)) if config.network.sigma_is == "scheduled" else algorithm
 
 

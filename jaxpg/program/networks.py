@@ -40,7 +40,7 @@ SIGMAS: dict[str, Callable[[float], Sigma]] = {
 
 def make_networks(config: Config, env: Any) -> Networks:
     """Actor and critic for the environment's sizes."""
-    return NETWORKS[config.choices["network"]].built(config.network, env.observation_size, env.action_size)
+    return NETWORKS[config.choices["network"]].make(config.network, env.observation_size, env.action_size)
 
 
 def make_mlp(options: Any, observation_size: int, action_size: int) -> Networks:

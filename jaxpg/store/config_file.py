@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from jaxpg.config.configuration import Config, from_yaml, not_a_configuration
+from jaxpg.config.configuration import Config, from_yaml, make_unreadable_error
 from jaxpg.store import files
 
 
@@ -17,5 +17,5 @@ def load(path: Path) -> Config:
     try:
         text = files.read(path).decode()
     except (OSError, ValueError) as error:  # ValueError: not UTF-8, or an invalid path
-        raise not_a_configuration(str(path), error) from error
+        raise make_unreadable_error(str(path), error) from error
     return from_yaml(text, str(path))

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from jaxpg.config.configuration import Config
-from jaxpg.config.sweep import described, settings
+from jaxpg.config.sweep import format_setting, list_settings
 from jaxpg.store.statistics import has_interval, interquartile_mean, seed_interval, seed_interval_name
 
 Lines = Sequence[dict[str, Any]]
@@ -44,7 +44,7 @@ def rank(scores: np.ndarray) -> np.ndarray:
 
 def make_heading(config: Config) -> str:
     """The heading of the table."""
-    number, seeds = len(settings(config.sweep)), config.run.num_seeds
+    number, seeds = len(list_settings(config.sweep)), config.run.num_seeds
     which = f"the best {MAX_ROWS} of {number} settings" if number > MAX_ROWS else "settings, best first"
     interval = f"[{seed_interval_name(seeds)}]" if has_interval(seeds) else f"({seed_interval_name(seeds)})"
     score = f"interquartile mean of {seeds} seeds {interval}" if seeds > 1 else f"seed {config.run.seed}"
@@ -53,15 +53,16 @@ def make_heading(config: Config) -> str:
 
 def make_table(config: Config, lines: Lines) -> dict[str, str]:
     """The best settings, best first, each with its return as `format_score` shows it."""
-    returns, names = last_returns(config, lines), settings(config.sweep)
-    return {described(names[i]): format_score(returns[i]) for i in rank(returns)[:MAX_ROWS]}
+    returns, names = last_returns(config, lines), list_settings(config.sweep)
+    return {format_setting(names[i]): format_score(returns[i]) for i in rank(returns)[:MAX_ROWS]}
 
 
 def select_curves(config: Config, lines: Lines) -> dict[str, slice]:
     """The best settings, best first, each with its agents."""
-    seeds, names = config.run.num_seeds, settings(config.sweep)
+    seeds, names = config.run.num_seeds, list_settings(config.sweep)
     return {
-        described(names[i]): slice(i * seeds, (i + 1) * seeds) for i in rank(last_returns(config, lines))[:MAX_CURVES]
+        format_setting(names[i]): slice(i * seeds, (i + 1) * seeds)
+        for i in rank(last_returns(config, lines))[:MAX_CURVES]
     }
 
 

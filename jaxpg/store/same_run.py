@@ -54,7 +54,7 @@ def check_checkpoint(checkpoints: Checkpoints, number: int, config: Config) -> N
 
 def _find_differences(before: Config, after: Config) -> list[tuple[str, str, str]]:
     """The differing options that make it another run: name, and descriptions of the old and the new value."""
-    old, new = configuration.named(before), configuration.named(after)
+    old, new = configuration.to_arguments(before), configuration.to_arguments(after)
     names = [name for name in old | new if name not in RESUMABLE and old.get(name) != new.get(name)]
     return [(name, _describe(name, old), _describe(name, new)) for name in names]
 

@@ -34,7 +34,7 @@ def show_results(session: Session, times: Times | None) -> None:
         "speed": f"{times.rate:,.0f} steps/s",
         "time": f"{times.compiling:.1f} s compiling, {times.training:.1f} s training",
         "run folder": path,
-        "evaluate it": f"{registered.command(env, 'evaluate')} run={shlex.quote(path)}",
+        "evaluate it": f"{registered.format_command(env, 'evaluate')} run={shlex.quote(path)}",
     }
     display.show_table(_summarize_evaluations(lines) | rows)
     if config.run.report:

@@ -147,7 +147,7 @@ def _read_agents(path: str) -> Iterator[Agent]:
             metric: {line["steps"]: value for line in lines for value in _find_value(line, metric, i)}
             for metric in PANELS
         }
-        yield Agent(configuration.named(agent_config), agent_config.run.seed, curves)
+        yield Agent(configuration.to_arguments(agent_config), agent_config.run.seed, curves)
 
 
 def _find_value(line: Mapping[str, Any], metric: str, agent: int) -> Iterator[float]:

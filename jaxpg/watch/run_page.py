@@ -97,7 +97,7 @@ def build_report(run_folder: RunFolder, config: Config, stages: Stages) -> Json:
         "diagnostics": try_part("diagnostics", lambda: make_diagnostics(config, lines), []),
         "tables": _make_settings_table(config, lines),
         "improvement": None,
-        "command": try_part("command", lambda: repeat.command(config)),
+        "command": try_part("command", lambda: repeat.format_command(config)),
         "configuration": try_part("configuration", lambda: _list_options(config), []),
         "versions": try_part("versions", lambda: _list_versions(run_folder), []),
         **{"player": None, "portrait": None, "workspace": None},
@@ -187,8 +187,8 @@ def _find_references(
 
 def _list_options(config: Config) -> list[list[str | None]]:
     """Name and value of each option, and its default if that differs; the run's place is not a difference."""
-    values = configuration.named(config)
-    defaults = repeat.defaults(config) | {name: values[name] for name in repeat.NOT_REPEATED}
+    values = configuration.to_arguments(config)
+    defaults = repeat.compose_defaults(config) | {name: values[name] for name in repeat.NOT_REPEATED}
     return [
         [name, str(value), None if value == defaults.get(name) else str(defaults.get(name))]
         for name, value in values.items()

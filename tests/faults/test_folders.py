@@ -141,7 +141,7 @@ def is_right(runs, run, command, status, output, error):
     assert (status, error) == (0, ""), error
     if command in ("resume", "begin or resume"):
         config, usual = (
-            configuration.named(config_file.load(path / "config.yaml")) for path in (run, runs / "undisturbed")
+            configuration.to_arguments(config_file.load(path / "config.yaml")) for path in (run, runs / "undisturbed")
         )
         if config | {"run_dir": None} == usual | {"run_dir": None}:  # else another interval, say, which may change
             assert digest(run) == digest(runs / "undisturbed")
