@@ -28,7 +28,7 @@ MATHS = ("returns", "estimators", "baselines", "losses", "distributions", "featu
 PROGRAMS = ("networks", "vector_env", "policy", "rollout", "methods", "updates", "actor_critic", "ppo", "online")
 LIBRARY = (*MATHS, *PROGRAMS, "training", "evaluation")
 
-__all__ = ["__version__", "load", *LIBRARY]
+__all__ = ["__version__", "load", *LIBRARY]  # noqa: PLE0604 (all are texts)
 
 if TYPE_CHECKING:
     from jaxpg.deploy.python_policy import Policy

@@ -114,8 +114,8 @@ class Simulations:
         sound = np.all([_sound(name, values) for name, values in zip(self._inputs, rows, strict=True)], 0)
         batch.step(sound, self._num_substeps)
         sound &= ~has_diverged(batch.warning[..., 1])
-        for name, result in zip(self._outputs, results, strict=True):
-            result = result.reshape(len(sound), -1)
+        for name, array in zip(self._outputs, results, strict=True):
+            result = array.reshape(len(sound), -1)
             result[...] = _field(batch, name)
             result[~sound] = np.nan if result.dtype.kind == "f" else 0
 

@@ -13,7 +13,7 @@ from envs.physics.expressions import Scalar, build, identity, is_constant, is_nu
 from envs.physics.folding import fold
 
 
-class UnsupportedPrimitive(ValueError):
+class UnsupportedPrimitiveError(ValueError):
     """A primitive, or a use of one, that has no scalar form; the message begins with its name."""
 
 

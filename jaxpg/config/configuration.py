@@ -117,6 +117,7 @@ def divide(values: Mapping[str, Any]) -> tuple[dict[str, Any], dict[str, Any]]:
 
 
 def check_choices(choices: Mapping[str, Any]) -> None:
+    """Raises OptionError for a member of a group that does not exist, with the nearest one."""
     names = {group: str(choice) for group, choice in choices.items()}
     problems = [
         describe_unknown(group, name, GROUPS[group]) for group, name in names.items() if name not in GROUPS[group]

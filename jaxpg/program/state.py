@@ -51,6 +51,7 @@ def start(train: TrainState) -> RunState:
 
 
 def current_policy(train: TrainState) -> Policy:
+    """The policy as it is after the updates made so far."""
     return Policy(train.params, train.normalizer)
 
 

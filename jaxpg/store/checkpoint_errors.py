@@ -25,9 +25,9 @@ class SaveError(Exception):
 
 
 def reason(error: BaseException) -> str:
-    """The operating system's words, if it has refused something, and else the first line of the message.
+    r"""The operating system's words, if it has refused something, and else the first line of the message.
 
-    >>> reason(ValueError("first\\nsecond"))
+    >>> reason(ValueError("first\nsecond"))
     'first'
     """
     cause: BaseException | None = error

@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 import mujoco
 import numpy as np
 
-from jaxpg.watch.attempts import NotDrawn
+from jaxpg.watch.attempts import DrawingError
 
 SIDE = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])  # for models without a camera
 TRAVEL = 4.0  # a robot that travels this many times its own size is kept in the middle
@@ -95,7 +95,7 @@ def make_picture(model: Any) -> Picture:
     the bodies.
 
     Raises:
-      NotDrawn: there are no bodies either.
+      DrawingError: there are no bodies either.
     """
     axes, data = camera_axes(model), mujoco.MjData(model)
     mujoco.mj_kinematics(model, data)
@@ -105,7 +105,7 @@ def make_picture(model: Any) -> Picture:
         model
     )
     if not parts:
-        raise NotDrawn("the model has no geoms and no bodies")
+        raise DrawingError("the model has no geoms and no bodies")
     depth = (data.geom_xpos if geoms else data.xipos) @ axes[2]
     parts.sort(key=lambda part: round(float(depth[part.number]), 6))
     return Picture(model, axes, parts, not geoms, _find_motors(model, axes))

@@ -11,7 +11,7 @@ import numpy as np
 from envs.scenes import PhasePlane, Scene
 from jaxpg.store.policies import StoredPolicy
 from jaxpg.watch import drawing
-from jaxpg.watch.attempts import NotDrawn, attempt
+from jaxpg.watch.attempts import DrawingError, attempt
 from jaxpg.watch.clips import Clip, find_command_names, find_limits, make_clip
 from jaxpg.watch.curves import round_numbers
 from jaxpg.watch.recording import Recording, compute_value_map
@@ -86,7 +86,7 @@ def _list_motors(stored: StoredPolicy, picture: drawing.Picture) -> list[Json]:
     names, number = find_command_names(stored), picture.model.nu
     if len(names) != number:
         commands = "command" if len(names) == 1 else "commands"
-        raise NotDrawn(f"the policy has {len(names)} {commands}, the model {number} actuators: cannot match them")
+        raise DrawingError(f"the policy has {len(names)} {commands}, the model {number} actuators: cannot match them")
     limits = _list_limits(stored)
     return [
         {"name": names[motor.command], "limit": limits.get(names[motor.command]), "sign": motor.sign}
@@ -123,7 +123,7 @@ def _make_portrait(plane: PhasePlane, stages: Mapping[str, StoredPolicy]) -> Jso
     stored = next(iter(stages.values()))
     maps = compute_value_map(stored, [stage.policy for stage in stages.values()], GRID, GRID)
     if not np.isfinite(maps).all():
-        raise NotDrawn("the critic's values are not finite everywhere")
+        raise DrawingError("the critic's values are not finite everywhere")
     axes = [
         {"label": label, "range": list(ends), "wraps": wraps}
         for label, ends, wraps in zip(plane.labels, plane.ranges, plane.wraps, strict=True)

@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import jax
 
 from envs.scenes import PhasePlane, Scene, find_scene
-from jaxpg.watch.attempts import NotDrawn, attempt, describe_error
+from jaxpg.watch.attempts import DrawingError, attempt, describe_error
 
 
 class View(NamedTuple):
@@ -40,11 +40,11 @@ def _find_scene(env: Any, state: Any) -> Scene | None:
     import mujoco  # slow to import, and not needed without a scene
 
     if not isinstance(scene.model, mujoco.MjModel):
-        raise NotDrawn(f"scene.model is a {type(scene.model).__name__}, expected a mujoco.MjModel")
+        raise DrawingError(f"scene.model is a {type(scene.model).__name__}, expected a mujoco.MjModel")
     _check_shape("scene.qpos(state)", scene.qpos, (state,), (scene.model.nq,))
     dt = _ask("dt", lambda env: float(env.dt), env)
     if not 0 < dt < math.inf:
-        raise NotDrawn(f"dt is {dt}, expected seconds between two actions")
+        raise DrawingError(f"dt is {dt}, expected seconds between two actions")
     return scene
 
 
@@ -52,7 +52,7 @@ def _has_goal(scene: Scene, state: Any) -> bool:
     _check_shape("scene.goal(state)", scene.goal, (state,), (3,))
     radius = scene.goal_radius
     if radius is not None and not 0 < float(radius) < math.inf:
-        raise NotDrawn(f"scene.goal_radius is {radius}, expected metres or None")
+        raise DrawingError(f"scene.goal_radius is {radius}, expected metres or None")
     return True
 
 
@@ -61,9 +61,9 @@ def _find_plane(env: Any, state: Any) -> PhasePlane | None:
     if plane is None:
         return None
     if not len(plane.labels) == len(plane.ranges) == len(plane.wraps) == 2:
-        raise NotDrawn("phase_plane must have two labels, two ranges and two values of wraps")
+        raise DrawingError("phase_plane must have two labels, two ranges and two values of wraps")
     if not all(-math.inf < low < high < math.inf for low, high in plane.ranges):
-        raise NotDrawn(f"phase_plane.ranges are {plane.ranges}, expected finite lower and upper ends")
+        raise DrawingError(f"phase_plane.ranges are {plane.ranges}, expected finite lower and upper ends")
     _check_shape("phase_plane.coordinates(state)", plane.coordinates, (state,), (2,))
     number = jax.ShapeDtypeStruct((), float)
     _check_shape("phase_plane.observe(x, y)", plane.observe, (number, number), state.obs.shape)
@@ -71,14 +71,14 @@ def _find_plane(env: Any, state: Any) -> PhasePlane | None:
 
 
 def _ask(name: str, ask: Callable, *arguments: Any) -> Any:
-    """The result of the environment's own code; an exception there becomes NotDrawn."""
+    """The result of the environment's own code; an exception there becomes DrawingError."""
     try:
         return ask(*arguments)
     except Exception as error:
-        raise NotDrawn(f"{name} raises {describe_error(error)}") from error
+        raise DrawingError(f"{name} raises {describe_error(error)}") from error
 
 
 def _check_shape(name: str, function: Callable, arguments: tuple, shape: tuple[int, ...]) -> None:
     result = _ask(name, lambda: jax.eval_shape(function, *arguments))
     if getattr(result, "shape", None) != tuple(shape):
-        raise NotDrawn(f"{name} has the shape {getattr(result, 'shape', None)}, expected {tuple(shape)}")
+        raise DrawingError(f"{name} has the shape {getattr(result, 'shape', None)}, expected {tuple(shape)}")

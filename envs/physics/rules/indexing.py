@@ -7,7 +7,7 @@ import numpy as np
 
 from envs.physics.arrays import Array, choose_array, is_numeric, promote
 from envs.physics.expressions import Expression
-from envs.physics.primitives import UnsupportedPrimitive
+from envs.physics.primitives import UnsupportedPrimitiveError
 from envs.physics.rules.elementwise import RULES as ELEMENTWISE
 
 
@@ -26,7 +26,7 @@ def _dynamic_slice(aval, x, *start, slice_sizes):
 
 def _dynamic_update_slice(aval, x, update, *start):
     if not is_numeric(*start):
-        raise UnsupportedPrimitive("dynamic_update_slice: the place depends on the data")
+        raise UnsupportedPrimitiveError("dynamic_update_slice: the place depends on the data")
     start = np.clip(np.array([int(s) for s in start], int), 0, np.subtract(x.shape, update.shape))
     x, update = promote(x, update)
     result = x.copy()
@@ -42,7 +42,7 @@ def _traced_index(name: str, indices) -> tuple[int | None, Expression | None]:
     """The one index that is an expression, with its place; (None, None) if all are known."""
     traced = [(i, index.item()) for i, index in enumerate(indices) if isinstance(index.item(), Expression)]
     if len(traced) > 1:
-        raise UnsupportedPrimitive(f"{name}: more than one index depends on the data")
+        raise UnsupportedPrimitiveError(f"{name}: more than one index depends on the data")
     return traced[0] if traced else (None, None)
 
 
@@ -58,7 +58,7 @@ def _gather(aval, x, indices, *, dimension_numbers, slice_sizes, mode, fill_valu
         start[list(numbers.operand_batching_dims)] = [batch[d] for d in numbers.start_indices_batching_dims]
         traced = _traced_index("gather", [np.asarray(i, object) for i in indices[batch]])
         if traced[0] is not None:
-            raise UnsupportedPrimitive("gather: an index depends on the data")
+            raise UnsupportedPrimitiveError("gather: an index depends on the data")
         start[list(numbers.start_index_map)] = indices[batch]
         outside = np.any((start < 0) | (start > limits))
         if outside and "FILL" in str(mode):
@@ -76,7 +76,7 @@ def _out_of_bounds_value(dtype):
 
 def _scatter(aval, x, indices, updates, *, dimension_numbers, mode, update_jaxpr, **_):
     if not is_numeric(indices):
-        raise UnsupportedPrimitive("scatter: an index depends on the data")
+        raise UnsupportedPrimitiveError("scatter: an index depends on the data")
     numbers = dimension_numbers
     combine = _combiner(update_jaxpr)
     x, updates = promote(x, updates)

@@ -14,6 +14,7 @@ from jaxpg.store import files
 
 
 def packages() -> tuple[str, ...]:
+    """The packages that this logger needs."""
     return ("wandb",)
 
 
