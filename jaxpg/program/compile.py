@@ -19,6 +19,7 @@ from jaxpg.nonfinite import skip_nonfinite, stop_at_nonfinite
 from jaxpg.policy import deterministic_policy
 from jaxpg.program.agents import Agents, agents_of, with_values
 from jaxpg.program.algorithms import make_algorithm
+from jaxpg.program.allocator import trimming
 from jaxpg.program.backend import OPTIMIZED, RUN_ONCE
 from jaxpg.program.mapping import groups_at_once, in_groups, over_agents
 from jaxpg.program.networks import make_networks
@@ -76,15 +77,16 @@ def compile_program(
     of_group = jax.tree.map(lambda x: x[:size], agents)
     init = jax.jit(init).trace(of_group)
     shape = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype), init.out_info)
-    with _compilers() as pool:
+    with trimming(), _compilers() as pool:
         # Tracing holds Python's lock and compiling does not: one trace after the other, that of the longest compilation
         # first, so that no compilation waits for another one's trace.
         advance = pool.submit(jax.jit(advance).lower(of_group, shape.train, number=chunk).compile, OPTIMIZED)
         init = None if resumed else pool.submit(init.lower().compile, RUN_ONCE)
         play = pool.submit(jax.jit(play).lower(current_policy(shape.train)).compile, OPTIMIZED)
         meanwhile()
+        compiled = [fn and fn.result() for fn in (init, advance, play)]
     at_once = groups_at_once(config)
-    init, advance, play = (in_groups(fn.result(), size, at_once) if fn else None for fn in (init, advance, play))
+    init, advance, play = (fn and in_groups(fn, size, at_once) for fn in compiled)
 
     def advance_by(train, number=chunk):
         train, metrics = advance(agents, train, number=number)
