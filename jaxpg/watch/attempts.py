@@ -15,7 +15,7 @@ from typing import TypeVar
 from jaxpg.errors import UserError
 
 RAISE = "JAXPG_RAISE"
-Result = TypeVar("Drawn")
+Result = TypeVar("Result")
 
 
 class NotDrawn(Exception):
