@@ -5,6 +5,7 @@ Source: Schulman et al., Proximal policy optimization algorithms, arXiv 1707.063
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import jax
@@ -98,6 +99,7 @@ def minibatch_steps(
     """
     step = gradient_step(loss, optimizer, axis_name)
     num_steps = epochs * minibatches
+    farthest = math.inf if max_kl is None else max_kl
 
     def take(carry, numbered_minibatch):
         (params, opt_state, near), (number, minibatch) = carry, numbered_minibatch
@@ -107,7 +109,7 @@ def minibatch_steps(
     def take_while_near(carry, numbered_minibatch):
         def attempt():
             (params, opt_state, _), metrics = take(carry, numbered_minibatch)
-            near = metrics["kl"] <= max_kl  # of the parameters before the step
+            near = metrics["kl"] <= farthest  # of the parameters before the step
             taken = jax.tree.map(lambda new, old: jnp.where(near, new, old), (params, opt_state), carry[:2])
             return (*taken, near), jax.tree.map(lambda x: near * x, metrics)
 
@@ -116,7 +118,7 @@ def minibatch_steps(
 
     one = take if max_kl is None else take_while_near
 
-    def update(params, opt_state, batch, key, number=0):
+    def update(params, opt_state, batch, key, number: jax.Array | int = 0):
         def epoch(carry, numbers_and_key):
             numbers, key = numbers_and_key
             return jax.lax.scan(one, carry, (numbers, split_environments(batch, key, minibatches)))

@@ -8,6 +8,7 @@ once for every gradient step.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from typing import Any
 
 import jax
 from jax.sharding import AxisType, Mesh, PartitionSpec
@@ -15,9 +16,10 @@ from jax.sharding import AxisType, Mesh, PartitionSpec
 from jaxpg.types import Algorithm, PyTree, TrainState
 
 AXIS = "shards"
+Device = Any  # jax.Device, a class of a compiled module without types
 
 
-def sharded(algorithm: Algorithm, num_shards: int, devices: Sequence[jax.Device]) -> Algorithm:
+def sharded(algorithm: Algorithm, num_shards: int, devices: Sequence[Device]) -> Algorithm:
     """The algorithm of `num_shards` parts together: N environments in all, and one state of everything else.
 
         gradient = 1/D sum_i gradient_i,    of the D parts' environments
@@ -48,7 +50,7 @@ def sharded(algorithm: Algorithm, num_shards: int, devices: Sequence[jax.Device]
     return Algorithm(_joined_init(init), _joined_step(step, num_shards))
 
 
-def in_parts(fn: Callable[[PyTree, PyTree], PyTree], number: int, devices: Sequence[jax.Device]) -> Callable:
+def in_parts(fn: Callable[[PyTree, PyTree], PyTree], number: int, devices: Sequence[Device]) -> Callable:
     """`fn(shared, divided)`, which maps over the leading axis of `divided`, on several devices at once.
 
     Args:
@@ -63,7 +65,7 @@ def in_parts(fn: Callable[[PyTree, PyTree], PyTree], number: int, devices: Seque
     return jax.shard_map(fn, mesh=mesh, in_specs=(PartitionSpec(), divided), out_specs=divided, check_vma=False)
 
 
-def _mesh(devices: Sequence[jax.Device]) -> Mesh:
+def _mesh(devices: Sequence[Device]) -> Mesh:
     return jax.make_mesh((len(devices),), (AXIS,), axis_types=(AxisType.Auto,), devices=devices)
 
 

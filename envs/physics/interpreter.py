@@ -9,7 +9,7 @@ which under `vmap` are operations on contiguous vectors of the batch.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import jax
@@ -93,7 +93,7 @@ class Program:
     def _computed(self) -> list[Expression]:
         return [x for x in self._results if isinstance(x, Expression)]
 
-    def split(self, leaves: list) -> list[jax.Array]:
+    def split(self, leaves: Sequence) -> list[jax.Array]:
         """The elements of the arguments' leaves, in order."""
         return self._split(*leaves)
 
@@ -107,7 +107,7 @@ class Program:
             for x, dtype in zip(self._results, dtypes, strict=True)
         ]
 
-    def join(self, elements: list[jax.Array]) -> list[jax.Array]:
+    def join(self, elements: Sequence[jax.Array]) -> list[jax.Array]:
         """The result's leaves from their elements."""
         leaves, begin = [], 0
         for array, dtype in zip(self.outputs, self.output_dtypes, strict=True):
@@ -223,7 +223,7 @@ def _scan(operands, wanted, *, jaxpr, length, reverse, **groups):
     return [*carry, *stacked]
 
 
-def _scan_operands(operands, *, num_consts=None, num_carry=None, ft_in=None, **_):
+def _scan_operands(operands, *, num_consts=0, num_carry=0, ft_in=None, **_):
     """(consts, carry, xs): by their numbers, or from jax 0.12 on by a tree that has them as its branches."""
     if ft_in is not None:
         return map(list, ft_in.update(operands).unpack())

@@ -67,7 +67,7 @@ def kept(name: str, make: Callable[[], Program]) -> Program:
 def name_of(model: mujoco.MjModel, inputs: tuple[str, ...], outputs: tuple[str, ...]) -> str:
     """A name for the program of a model's step, other than that of any program that may differ from it."""
     return hashlib.sha256(
-        model_digest(model) + repr((inputs, outputs, jax.config.jax_enable_x64, *_makers())).encode()
+        model_digest(model) + repr((inputs, outputs, jax.config.values["jax_enable_x64"], *_makers())).encode()
     ).hexdigest()
 
 

@@ -173,7 +173,7 @@ def change(config: Config, changes: Mapping[str, Any]) -> Config:
     Raises:
       OptionError: an unknown name, another member of a group, a wrong type or a value out of range.
     """
-    check_choices(config.choices | members(changes))
+    check_choices({**config.choices, **members(changes)})
     others = [name for name in GROUPS if changes.get(name, config.choices[name]) != config.choices[name]]
     if others:
         raise OptionError([f"{name}={changes[name]}: the run has {name}={config.choices[name]}" for name in others])

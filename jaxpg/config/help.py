@@ -34,7 +34,8 @@ def train_help(arguments: Sequence[str]) -> str:
     for group in ("", *GROUPS):
         schema = GROUPS[group][config.choices[group]] if group else Run
         names = [name for name in fields if name.rpartition(".")[0] == group]
-        lines += ["", schema.__doc__.splitlines()[0], *(_line(name, values[name], fields[name]) for name in names)]
+        about = (schema.__doc__ or schema.__name__).splitlines()[0]
+        lines += ["", about, *(_line(name, values[name], fields[name]) for name in names)]
     names = ", ".join(sweepable(config.choices))
     lines += ["", *textwrap.wrap(f"{SWEEP} {names}.", width=120)]
     lines += ["", "Shown are the defaults for the environment and the algorithm named above; add env=... or algo=..."]

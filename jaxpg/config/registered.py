@@ -79,9 +79,11 @@ def program_of(env: str) -> dict[str, str]:
     """What goes into config.yaml of the program that registered an environment of somebody's own, and is running."""
     main = sys.modules["__main__"]
     module, path = getattr(main, "__spec__", None), getattr(main, "__file__", None)
-    if env in envs.SHIPPED or not (module or path):
+    if env in envs.SHIPPED:
         return {}
-    return {PROGRAM: f"-m {module.name}" if module else os.path.abspath(path)}
+    if module:
+        return {PROGRAM: f"-m {module.name}"}
+    return {PROGRAM: os.path.abspath(path)} if path else {}
 
 
 def command(env: str, verb: str) -> str:

@@ -24,7 +24,7 @@ LOGGERS = ("wandb", "mlflow")  # besides TensorBoard
 LARGEST = 2**31 - 1  # size of an array's axis: XLA's indices are 32-bit numbers
 
 
-def number(default: float | None, help: str, **bounds: float) -> Any:
+def number(default: float | None, help: str, **bounds: Any) -> Any:
     """An option whose value only enters formulas: the program can take it as an argument, so that it can be swept.
 
     Args:
@@ -187,3 +187,9 @@ class Run:
     loggers: list[str] = option([], "where metrics go besides TensorBoard", choices=LOGGERS)
     cache: bool = option(True, "keep compiled programs in the user's cache folder, for the next run")
     report: bool = option(True, "end with report.html: curves, and episodes to watch")
+
+    @property
+    def rollout_steps(self) -> int:
+        """`num_steps`, which a checked configuration always has."""
+        assert self.num_steps is not None
+        return self.num_steps

@@ -114,7 +114,7 @@ def make_picture(model: Any) -> Picture:
 def find_geoms(model: Any) -> list[int]:
     """The visible geoms, or all if none is visible; without planes and height fields."""
     unbounded = (mujoco.mjtGeom.mjGEOM_PLANE, mujoco.mjtGeom.mjGEOM_HFIELD)
-    geoms = [int(i) for i in np.flatnonzero(~np.isin(model.geom_type, unbounded)) if _find_rgba(model, i)[3]]
+    geoms = [i for i in np.flatnonzero(~np.isin(model.geom_type, unbounded)).tolist() if _find_rgba(model, i)[3]]
     return [i for i in geoms if model.geom_group[i] < 3] or geoms
 
 

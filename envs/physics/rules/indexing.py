@@ -13,9 +13,10 @@ from envs.physics.rules.elementwise import RULES as ELEMENTWISE
 
 def _dynamic_slice(aval, x, *start, slice_sizes):
     limits = np.subtract(x.shape, slice_sizes)
-    axis, index = _traced_index("dynamic_slice", start)
-    if axis is None:
+    traced = _traced_index("dynamic_slice", start)
+    if traced is None:
         return _window(x, np.clip(np.array([int(s) for s in start], int), 0, limits), slice_sizes)
+    axis, index = traced
     known = [0 if i == axis else int(s) for i, s in enumerate(start)]
     windows = [
         _window(x, np.clip([*known[:axis], at, *known[axis + 1 :]], 0, limits), slice_sizes)
@@ -38,12 +39,12 @@ def _window(x: Array, start, sizes) -> Array:
     return x[tuple(slice(s, s + size) for s, size in zip(start, sizes, strict=True))]
 
 
-def _traced_index(name: str, indices) -> tuple[int | None, Expression | None]:
-    """The one index that is an expression, with its place; (None, None) if all are known."""
+def _traced_index(name: str, indices) -> tuple[int, Expression] | None:
+    """The one index that is an expression, with its place; None if all are known."""
     traced = [(i, index.item()) for i, index in enumerate(indices) if isinstance(index.item(), Expression)]
     if len(traced) > 1:
         raise UnsupportedPrimitiveError(f"{name}: more than one index depends on the data")
-    return traced[0] if traced else (None, None)
+    return traced[0] if traced else None
 
 
 def _gather(aval, x, indices, *, dimension_numbers, slice_sizes, mode, fill_value=None, **_):
@@ -57,7 +58,7 @@ def _gather(aval, x, indices, *, dimension_numbers, slice_sizes, mode, fill_valu
         start = np.zeros(x.ndim, int)
         start[list(numbers.operand_batching_dims)] = [batch[d] for d in numbers.start_indices_batching_dims]
         traced = _traced_index("gather", [np.asarray(i, object) for i in indices[batch]])
-        if traced[0] is not None:
+        if traced is not None:
             raise UnsupportedPrimitiveError("gather: an index depends on the data")
         start[list(numbers.start_index_map)] = indices[batch]
         outside = np.any((start < 0) | (start > limits))
