@@ -85,18 +85,18 @@ def compile_program(
         starting = None if resumed else pool.submit(traced.lower().compile, RUN_ONCE)
         playing = pool.submit(jax.jit(play).lower(current_policy(shape.train)).compile, OPTIMIZED)
         meanwhile()
-        start, go_on, evaluate_policy = starting and starting.result(), advancing.result(), playing.result()
-    in_turns = functools.partial(in_groups, size=size, at_once=groups_at_once(config))
-    go_on = in_turns(go_on)
+        start_group, advance_group, play_group = starting and starting.result(), advancing.result(), playing.result()
+    of_all = functools.partial(in_groups, size=size, at_once=groups_at_once(config))
+    advance_all = of_all(advance_group)
 
     def advance_by(train, number=chunk):
-        train, metrics = go_on(agents, train, number=number)
+        train, metrics = advance_all(agents, train, number=number)
         return train, {name: np.asarray(x)[:, :number] for name, x in metrics.items()}
 
     return Program(
-        functools.partial(in_turns(start), agents) if start else None,
+        functools.partial(of_all(start_group), agents) if start_group else None,
         advance_by,
-        in_turns(evaluate_policy),
+        of_all(play_group),
         jax.tree.map(lambda x: jax.ShapeDtypeStruct((len(agents.seed), *x.shape[1:]), x.dtype), shape),
     )
 
