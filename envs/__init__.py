@@ -15,6 +15,7 @@ from types import MappingProxyType
 from typing import Any, NamedTuple
 
 from envs import arm, brax_env, pendulum, playground_env, quadratic
+from envs.base import Env
 from envs.contract import conform
 from envs.options import OptionError, build, describe_unknown, find_declaration_problems
 from envs.user_code import catch_user_errors
@@ -32,7 +33,7 @@ class Entry(NamedTuple):
     """
 
     config: type
-    build: Callable[[Any], Any]
+    build: Callable[[Any], Env]
     training: Mapping[str, Mapping[str, Any]] = MappingProxyType({})
 
 
@@ -62,7 +63,7 @@ def register(name: str, entry: Entry) -> None:
     REGISTRY[name] = entry
 
 
-def make(name: str, /, **overrides: Any) -> Any:
+def make(name: str, /, **overrides: Any) -> Env:
     """The environment called `name`, with some of its options changed.
 
     Args:
@@ -79,7 +80,7 @@ def make(name: str, /, **overrides: Any) -> Any:
     return make_from_config(name, build(find(name).config, overrides))
 
 
-def make_from_config(name: str, config: Any) -> Any:
+def make_from_config(name: str, config: Any) -> Env:
     """The environment called `name` with these options; raises OptionError as `make` does.
 
     A user's environment is checked first. Those of brax and Playground are not, as they are slow to trace.

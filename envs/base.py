@@ -12,8 +12,9 @@ which is slow. Environments have no time limit: `done` means termination only.
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
 
 import jax
 import jax.numpy as jnp
@@ -26,8 +27,7 @@ from envs.scenes import Scene
 ASSETS = Path(__file__).parent / "assets"
 
 
-@struct.dataclass
-class State:
+class State(struct.PyTreeNode):
     """One environment after a reset or a step: the fields of `brax.envs.base.State`.
 
     Attributes:
@@ -45,6 +45,30 @@ class State:
     done: jax.Array
     metrics: dict[str, jax.Array] = struct.field(default_factory=dict)
     info: dict[str, Any] = struct.field(default_factory=dict)
+
+
+class AnyState(Protocol):
+    """What is read of every state: of `State`, of brax's, and of a named tuple or dataclass of your own."""
+
+    @property
+    def obs(self) -> jax.Array: ...
+    @property
+    def reward(self) -> jax.Array: ...
+    @property
+    def done(self) -> jax.Array: ...
+    @property
+    def metrics(self) -> Mapping[str, jax.Array]: ...
+
+
+class Env(Protocol):
+    """What every environment has. An `interface` (below) and what `envs.scenes` reads are optional."""
+
+    @property
+    def observation_size(self) -> int: ...
+    @property
+    def action_size(self) -> int: ...
+    def reset(self, rng: jax.Array, /) -> AnyState: ...
+    def step(self, state: Any, action: jax.Array, /) -> AnyState: ...  # a state of its own
 
 
 class Interface(NamedTuple):
@@ -89,6 +113,11 @@ class MjxEnv:
       check: log differences between MJX and C MuJoCo (`envs.physics.check_model`), which takes a second or more. The
         shipped environments leave this to the tests.
     """
+
+    if TYPE_CHECKING:  # a subclass has them
+
+        def reset(self, rng: jax.Array, /) -> AnyState: ...
+        def step(self, state: Any, action: jax.Array, /) -> AnyState: ...
 
     def __init__(self, spec: Any, num_substeps: int = 1, physics: str = "scalar", check: bool = True):
         self.model = compile_model(spec)

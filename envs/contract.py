@@ -16,7 +16,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from envs.base import Interface, interface, with_fields
+from envs.base import Env, Interface, interface, with_fields
 from envs.options import OptionError
 from envs.user_code import catch_user_errors
 
@@ -26,7 +26,7 @@ NUMERIC_PATH = re.compile(rf"\.({'|'.join(NUMERIC_FIELDS)})\b")  # paths of thei
 ADVICE = ("an index or jnp.squeeze makes it a scalar", "jnp.ravel makes it one-dimensional")  # by dimensions
 
 
-def conform(env: Any, name: str) -> Any:
+def conform(env: Any, name: str) -> Env:
     """The environment itself, or a wrapper that makes its numbers floating point.
 
     Args:
@@ -67,7 +67,10 @@ class FloatingEnv:
       first, second: shapes and types of the State that its `reset` and its `step` return.
     """
 
-    def __init__(self, env: Any, first: Any, second: Any):
+    observation_size: int  # like all that is not here, the environment's own
+    action_size: int
+
+    def __init__(self, env: Env, first: Any, second: Any):
         self.env, self._floating_types = env, _find_floating_types(first, second)
         self._env_types = jax.tree.map(
             lambda a, b, other: a if a == b else other, _read_types(first), _read_types(second), self._floating_types

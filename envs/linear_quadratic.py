@@ -117,9 +117,13 @@ def lambda_targets(problem: Problem, policy: Policy, critic: list[Quadratic], la
       critic: T + 1 values that somebody believes in, exact or not; the last one is of states in which all is over.
       lambda_: in [0, 1].
     """
+
+    def mix(x, y):
+        return (1 - lambda_) * x + lambda_ * y
+
     target, found = critic[-1], []
     for believed in critic[:0:-1]:
-        found.append(Quadratic(*((1 - lambda_) * x + lambda_ * y for x, y in zip(believed, target, strict=True))))
+        found.append(Quadratic(mix(believed.P, target.P), mix(believed.p, target.p), mix(believed.c, target.c)))
         target = backup(problem, policy, found[-1])
     return found[::-1]
 

@@ -18,9 +18,12 @@ import operator
 import types
 import typing
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from typing import Any, Literal, TypeVar
+from typing import TYPE_CHECKING, Any, Literal, TypeVar
 
-Config = TypeVar("Config")
+if TYPE_CHECKING:
+    from _typeshed import DataclassInstance
+
+Config = TypeVar("Config", bound="DataclassInstance")
 
 _BOUNDS = {"above": operator.gt, "at_least": operator.ge, "below": operator.lt, "at_most": operator.le}
 _TYPE_NAMES = {int: "a whole number", float: "a number", bool: "true or false", str: "a name", type(None): "null"}
@@ -199,7 +202,7 @@ def convert(hint: Any, value: Any) -> Any:
 
 def _convert_number(kind: type, value: Any) -> Any:
     try:
-        if isinstance(value, numbers.Real) and not isinstance(value, bool):  # includes numpy's numbers
+        if _is_real(value):
             if kind is float:
                 return float(value)
             if float(value).is_integer():
@@ -207,6 +210,10 @@ def _convert_number(kind: type, value: Any) -> Any:
     except OverflowError:
         raise ValueError("this number is too large") from None
     raise ValueError(f"expected {_TYPE_NAMES[kind]}")
+
+
+def _is_real(value: Any) -> bool:
+    return isinstance(value, numbers.Real) and not isinstance(value, bool)  # includes numpy's numbers
 
 
 def _convert_to_one_of(hints: Sequence[Any], value: Any) -> Any:

@@ -106,7 +106,7 @@ def make(config: PlaygroundConfig) -> Playground:
     # Hides messages of its dependencies while they are imported.
     with warnings.catch_warnings(), contextlib.redirect_stdout(io.StringIO()):
         warnings.simplefilter("ignore")
-        from mujoco_playground import registry
+        from mujoco_playground import registry  # pyright: ignore[reportMissingImports] # an extra of its own
 
         if config.name not in registry.ALL_ENVS:
             raise OptionError([describe_unknown("Playground environment", config.name, registry.ALL_ENVS)])

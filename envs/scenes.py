@@ -55,6 +55,16 @@ def find_scene(env: Any) -> Scene | None:
     return Scene(model, lambda state: state.pipeline_state.q) if model is not None else None
 
 
+def find_time_step(env: Any) -> float:
+    """Seconds between two actions, the environment's `dt`; what can be drawn has it."""
+    return float(env.dt)
+
+
+def find_phase_plane(env: Any) -> PhasePlane | None:
+    """The environment's `phase_plane`, if it has one."""
+    return getattr(env, "phase_plane", None)
+
+
 def find_references(env: Any) -> Mapping[str, float]:
     """Returns to compare with, by label; empty if the environment has none."""
     return getattr(env, "references", {})

@@ -16,11 +16,11 @@ import os
 from types import ModuleType
 from typing import TYPE_CHECKING
 
-import jaxlib
+import jaxlib.version
 
 from jaxpg.compatibility import check_jaxlib
 
-check_jaxlib(jaxlib.__version__)
+check_jaxlib(jaxlib.version.__version__)
 
 __version__ = "0.1.0"
 
@@ -28,7 +28,7 @@ MATHS = ("returns", "estimators", "baselines", "losses", "distributions", "featu
 PROGRAMS = ("networks", "vector_env", "policy", "rollout", "methods", "updates", "actor_critic", "ppo", "online")
 LIBRARY = (*MATHS, *PROGRAMS, "training", "evaluation")
 
-__all__ = ["__version__", "load", *LIBRARY]
+__all__ = ["__version__", "load", *LIBRARY]  # noqa: PLE0604 # pyright: ignore[reportUnsupportedDunderAll]
 
 if TYPE_CHECKING:
     from jaxpg.deploy.python_policy import Policy

@@ -44,7 +44,7 @@ def make_batch_fn(
     reward_scale: float,
     normalize_advantages: bool,
     axis_name: str | None = None,
-) -> Callable[[PyTree, PyTree, Transition], Batch]:
+) -> Callable[[PyTree, PyTree, Transition, jax.Array | bool], Batch]:
     """`prepare(params, normalizer, transition, counts) -> Batch`: the batch of a rollout.
 
     Steps that do not count (`counts`, `[T, N]` of bool) have weight 0; their numbers are replaced before anything is
@@ -55,7 +55,7 @@ def make_batch_fn(
       episode_length: the time limit.
     """
 
-    def prepare(params, normalizer, transition, counts=True):
+    def prepare(params, normalizer, transition, counts: jax.Array | bool = True):
         counts = jnp.broadcast_to(counts, transition.reward.shape)
         transition = neutralize(transition, counts, normalizer)
         obs = normalization.normalize(normalizer, transition.obs)

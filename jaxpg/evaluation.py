@@ -10,7 +10,7 @@ import jax.numpy as jnp
 
 from jaxpg.divergence import has_diverged
 from jaxpg.shapes import select
-from jaxpg.types import Metrics
+from jaxpg.types import Env, Metrics
 
 
 class Episodes(NamedTuple):
@@ -48,7 +48,7 @@ class Step(NamedTuple):
     alive: jax.Array
 
 
-def evaluate(env: Any, policy: Callable[[jax.Array], jax.Array], keys: jax.Array, episode_length: int) -> Episodes:
+def evaluate(env: Env, policy: Callable[[jax.Array], jax.Array], keys: jax.Array, episode_length: int) -> Episodes:
     """Plays one complete episode from each of N starts.
 
         R_i = sum_{t < T_i} r_{i,t},    a_t = policy(s_t)
@@ -66,7 +66,7 @@ def evaluate(env: Any, policy: Callable[[jax.Array], jax.Array], keys: jax.Array
 
 
 def play(
-    env: Any,
+    env: Env,
     policy: Callable[[jax.Array], jax.Array],
     keys: jax.Array,
     episode_length: int,

@@ -27,7 +27,7 @@ from gymnasium.vector import AutoresetMode
 from gymnasium.vector.utils import batch_space
 
 import envs
-from envs.base import interface, with_fields
+from envs.base import Env, interface, with_fields
 from envs.options import OptionError, build
 from jaxpg.divergence import has_diverged
 from jaxpg.shapes import select
@@ -45,7 +45,7 @@ class Single(gymnasium.Env):
 
     metadata = {"render_modes": []}  # noqa: RUF012, as in gymnasium.Env
 
-    def __init__(self, env: Any, bounds: Sequence[float] | None = None):
+    def __init__(self, env: Env, bounds: Sequence[float] | None = None):
         self.env = env
         self.observation_space, self.action_space = make_spaces(env, bounds)
         self._functions = compile_functions(env)
@@ -78,7 +78,7 @@ class Batch(gymnasium.vector.VectorEnv):
     metadata = {"render_modes": [], "autoreset_mode": AutoresetMode.NEXT_STEP}  # noqa: RUF012
 
     def __init__(
-        self, env: Any, num_envs: int, max_episode_steps: int | None = None, bounds: Sequence[float] | None = None
+        self, env: Env, num_envs: int, max_episode_steps: int | None = None, bounds: Sequence[float] | None = None
     ):
         self.env, self.num_envs = env, num_envs
         self.single_observation_space, self.single_action_space = make_spaces(env, bounds)
@@ -104,7 +104,7 @@ class Batch(gymnasium.vector.VectorEnv):
             if seeds[i] is not None:
                 self._generators[i], _ = seeding.np_random(seeds[i])
         fresh = self._functions.starts(self._start_seeds(mask, seeds))
-        self._state = fresh if self._state is None else select(mask, fresh, self._state)
+        self._state = fresh if self._state is None else select(jnp.asarray(mask), fresh, self._state)
         self._time[mask], self._ended[mask] = 0, False
         return _to_observation(self._state), {}
 
@@ -127,7 +127,9 @@ class Batch(gymnasium.vector.VectorEnv):
     def _expand_seeds(self, seed: int | Sequence[int | None] | None) -> list[int | None]:
         if seed is None:
             return [None] * self.num_envs
-        seeds = [seed + i for i in range(self.num_envs)] if isinstance(seed, (int, np.integer)) else list(seed)
+        if isinstance(seed, (int, np.integer)):
+            return [seed + i for i in range(self.num_envs)]
+        seeds = list(seed)
         if len(seeds) != self.num_envs:
             raise ValueError(f"expected {self.num_envs} seeds, one for each environment, not {len(seeds)}")
         return seeds
@@ -155,7 +157,7 @@ class EnvFunctions(NamedTuple):
 
 
 @functools.lru_cache(maxsize=8)
-def compile_functions(env: Any) -> EnvFunctions:
+def compile_functions(env: Env) -> EnvFunctions:
     """The compiled functions of an environment, shared by all that use it."""
     limits = find_limits(env)
     scale = np.where(np.isfinite(limits), limits, 1).astype(np.float32)
@@ -174,7 +176,7 @@ def compile_functions(env: Any) -> EnvFunctions:
     return EnvFunctions(jax.jit(start), jax.jit(step), jax.jit(jax.vmap(start)), jax.jit(steps))
 
 
-def step_finite(env: Any, state: Any, action: jax.Array) -> Any:
+def step_finite(env: Env, state: Any, action: jax.Array) -> Any:
     """One step; if the physics diverges, the episode terminates with the previous observation and reward 0.
 
     As in training, `jaxpg.divergence.has_diverged` decides that.
@@ -194,14 +196,14 @@ def draw_seed(seed: int | None, random: np.random.Generator) -> np.uint32:
     return np.uint32(random.integers(2**32) if seed is None else seed % 2**32)
 
 
-def make_spaces(env: Any, bounds: Sequence[float] | None) -> tuple[Box, Box]:
+def make_spaces(env: Env, bounds: Sequence[float] | None) -> tuple[Box, Box]:
     """Gymnasium's spaces of the observations within their bounds and the commands within their limits."""
     high = np.array([np.inf] * env.observation_size if bounds is None else bounds, np.float32)
     limits = find_limits(env)
     return Box(-high, high, dtype=np.float32), Box(-limits, limits, dtype=np.float32)
 
 
-def find_limits(env: Any) -> np.ndarray:
+def find_limits(env: Env) -> np.ndarray:
     """The commands at action 1, `[m]`: 1 without an interface, infinity without a limit."""
     limits = interface(env).limits if hasattr(env, "interface") else [1.0] * env.action_size
     return np.array([np.inf] * env.action_size if limits is None else limits, np.float32)
@@ -234,7 +236,7 @@ def make_vec(
     return Batch(env_, num_envs, max_episode_steps, bounds)
 
 
-def _build(name: str, render_mode: str | None, options: dict[str, Any]) -> tuple[Any, list[float] | None]:
+def _build(name: str, render_mode: str | None, options: dict[str, Any]) -> tuple[Env, list[float] | None]:
     if render_mode is not None:
         raise TypeError(f"render_mode='{render_mode}': these environments cannot render")
     if "episode_length" in options:
@@ -243,10 +245,10 @@ def _build(name: str, render_mode: str | None, options: dict[str, Any]) -> tuple
     return _share_env(name, config), BOUNDS[name](config) if name in BOUNDS else None
 
 
-_envs: dict[tuple[str, str], Any] = {}  # by name and options, the oldest first
+_envs: dict[tuple[str, str], Env] = {}  # by name and options, the oldest first
 
 
-def _share_env(name: str, config: Any) -> Any:
+def _share_env(name: str, config: Any) -> Env:
     """One environment for all users of the same options, so that its functions are compiled once."""
     key = name, repr(config)  # the config itself is not hashable if it has lists or is not frozen
     if key not in _envs:
@@ -263,7 +265,7 @@ BOUNDS: dict[str, Callable[[Any], list[float]]] = {
 }
 
 
-def _check_command(action: np.ndarray, space: Box) -> np.ndarray:
+def _check_command(action: np.ndarray, space: gymnasium.Space) -> np.ndarray:
     command = np.asarray(action, np.float32)
     if command.shape != space.shape:
         raise ValueError(f"expected an action of shape {space.shape}, not {command.shape}")

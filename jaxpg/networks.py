@@ -92,7 +92,7 @@ def fixed(std: float) -> Sigma:
     """Sigma is the constant `std`."""
 
     def log_std(actor, obs):
-        return _log_constant(std)(None, (actor.action_size,))
+        return _full_log(std, actor.action_size)
 
     return log_std
 
@@ -116,13 +116,17 @@ def state_dependent(std: float) -> Sigma:
 
     def log_std(actor, obs):
         x = actor.make_mlp()(obs)
-        return _log_constant(std)(None, (actor.action_size,)) + SIGMA_RANGE * jnp.tanh(x / SIGMA_RANGE)
+        return _full_log(std, actor.action_size) + SIGMA_RANGE * jnp.tanh(x / SIGMA_RANGE)
 
     return log_std
 
 
 def _log_constant(std: float) -> nn.initializers.Initializer:
     return nn.initializers.constant(jnp.log(std))
+
+
+def _full_log(std: float, size: int) -> jax.Array:
+    return jnp.full((size,), jnp.log(std), float)
 
 
 class GaussianActor(nn.Module):

@@ -130,7 +130,7 @@ def trace_update(
     critic_lr: float,
     reward_scale: float,
     discounted: bool,
-) -> Callable[[PyTree, Traces, PyTree, Transition], tuple[PyTree, Traces, Metrics]]:
+) -> Callable[[PyTree, Traces, PyTree, Transition, jax.Array | bool], tuple[PyTree, Traces, Metrics]]:
     """`update(params, traces, normalizer, transition, counts) -> (params, traces, metrics)`.
 
     Args:
@@ -145,7 +145,7 @@ def trace_update(
         mean, log_std = networks.policy(actor, obs)
         return networks.distribution.log_prob(u, mean, log_std), jnp.exp(log_std)
 
-    def update(params, traces, normalizer, transition, counts=True):
+    def update(params, traces, normalizer, transition, counts: jax.Array | bool = True):
         counts = jnp.broadcast_to(counts, transition.reward.shape)
         transition = neutralize(transition, counts, normalizer)
         obs = normalization.normalize(normalizer, transition.obs)

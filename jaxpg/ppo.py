@@ -5,6 +5,7 @@ Source: Schulman et al., Proximal policy optimization algorithms, arXiv 1707.063
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import jax
@@ -98,6 +99,7 @@ def minibatch_steps(
     """
     step = gradient_step(loss, optimizer, axis_name)
     num_steps = epochs * minibatches
+    kl_limit = math.inf if max_kl is None else max_kl
 
     def take_step(carry, numbered_minibatch):
         (params, opt_state, is_near), (number, minibatch) = carry, numbered_minibatch
@@ -107,7 +109,7 @@ def minibatch_steps(
     def take_step_if_near(carry, numbered_minibatch):
         def attempt():
             (params, opt_state, _), metrics = take_step(carry, numbered_minibatch)
-            is_near = metrics["kl"] <= max_kl  # the KL divergence before the step
+            is_near = metrics["kl"] <= kl_limit  # the KL divergence before the step
             selected = jax.tree.map(lambda new, old: jnp.where(is_near, new, old), (params, opt_state), carry[:2])
             return (*selected, is_near), jax.tree.map(lambda x: is_near * x, metrics)
 
@@ -116,7 +118,7 @@ def minibatch_steps(
 
     scan_step = take_step if max_kl is None else take_step_if_near
 
-    def update(params, opt_state, batch, key, number=0):
+    def update(params, opt_state, batch, key, number: jax.Array | int = 0):
         def epoch(carry, numbers_and_key):
             numbers, key = numbers_and_key
             return jax.lax.scan(scan_step, carry, (numbers, split_environments(batch, key, minibatches)))

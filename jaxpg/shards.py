@@ -8,6 +8,7 @@ per gradient step.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from typing import Any
 
 import jax
 from jax.sharding import AxisType, Mesh, PartitionSpec
@@ -15,9 +16,10 @@ from jax.sharding import AxisType, Mesh, PartitionSpec
 from jaxpg.types import Algorithm, PyTree, TrainState
 
 AXIS = "shards"
+Device = Any  # jax.Device, a class of a compiled module without types
 
 
-def shard(algorithm: Algorithm, num_shards: int, devices: Sequence[jax.Device]) -> Algorithm:
+def shard(algorithm: Algorithm, num_shards: int, devices: Sequence[Device]) -> Algorithm:
     """One algorithm from `num_shards` shards, with N environments in all and a single state of everything else.
 
         gradient = 1/D sum_i gradient_i    over the D shards
@@ -48,7 +50,7 @@ def shard(algorithm: Algorithm, num_shards: int, devices: Sequence[jax.Device]) 
     return Algorithm(_join_init(init), _join_step(step, num_shards))
 
 
-def map_in_parts(fn: Callable[[PyTree, PyTree], PyTree], number: int, devices: Sequence[jax.Device]) -> Callable:
+def map_in_parts(fn: Callable[[PyTree, PyTree], PyTree], number: int, devices: Sequence[Device]) -> Callable:
     """Runs `fn(shared, divided)`, which maps over the leading axis of `divided`, on several devices at once.
 
     Args:
@@ -63,7 +65,7 @@ def map_in_parts(fn: Callable[[PyTree, PyTree], PyTree], number: int, devices: S
     return jax.shard_map(fn, mesh=mesh, in_specs=(PartitionSpec(), rows), out_specs=rows, check_vma=False)
 
 
-def _make_mesh(devices: Sequence[jax.Device]) -> Mesh:
+def _make_mesh(devices: Sequence[Device]) -> Mesh:
     return jax.make_mesh((len(devices),), (AXIS,), axis_types=(AxisType.Auto,), devices=devices)
 
 

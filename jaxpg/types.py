@@ -3,12 +3,23 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Protocol
 
 import jax
 
 PyTree = Any
 Metrics = dict[str, jax.Array]
+
+
+class Env(Protocol):
+    """What the library needs of an environment: brax's functions and sizes, its states as `vector_env` reads them."""
+
+    @property
+    def observation_size(self) -> int: ...
+    @property
+    def action_size(self) -> int: ...
+    def reset(self, rng: jax.Array, /) -> Any: ...
+    def step(self, state: Any, action: jax.Array, /) -> Any: ...
 
 
 class Transition(NamedTuple):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import Protocol
 
 import jax
 import jax.numpy as jnp
@@ -18,6 +19,16 @@ from jaxpg.types import Metrics, PyTree
 Loss = Callable[[PyTree, Batch], tuple[jax.Array, Metrics]]
 # update(params, opt_state, batch, key, number) -> (params, opt_state, metrics), after `number` earlier updates
 Update = Callable[[PyTree, PyTree, Batch, jax.Array, jax.Array | int], tuple[PyTree, PyTree, Metrics]]
+
+
+class Step(Protocol):
+    """An `Update` that draws nothing."""
+
+    def __call__(
+        self, params: PyTree, opt_state: PyTree, batch: Batch, key: jax.Array | None = None, number: jax.Array | int = 0
+    ) -> tuple[PyTree, PyTree, Metrics]: ...
+
+
 # policy_loss(batch, mean, log_std, log_prob) -> (L_pi, metrics)
 PolicyLoss = Callable[[Batch, jax.Array, jax.Array, jax.Array], tuple[jax.Array, Metrics]]
 # critic_loss(batch, value) -> L_V
@@ -62,7 +73,7 @@ def sum_of_losses(networks: Networks, entropy_coef: float, policy_loss: PolicyLo
     return loss
 
 
-def gradient_step(loss: Loss, optimizer: optax.GradientTransformation, axis_name: str | None = None) -> Update:
+def gradient_step(loss: Loss, optimizer: optax.GradientTransformation, axis_name: str | None = None) -> Step:
     """One gradient step on the whole batch.
 
     Args:
@@ -73,7 +84,7 @@ def gradient_step(loss: Loss, optimizer: optax.GradientTransformation, axis_name
     """
     optimizer = optax.with_extra_args_support(optimizer)
 
-    def update(params, opt_state, batch, key=None, number=0):
+    def update(params, opt_state, batch, key=None, number: jax.Array | int = 0):
         gradients, metrics = collectives.mean(jax.grad(loss, has_aux=True)(params, batch), axis_name)
         steps, opt_state = optimizer.update(gradients, opt_state, params, progress=number)
         metrics = metrics | {"gradient_norm": optax.tree.norm(gradients)}
@@ -101,4 +112,5 @@ def scale_by_progress(schedule: optax.Schedule) -> optax.GradientTransformationE
         scaled = jax.tree.map(lambda g: jnp.asarray(factor, g.dtype) * g, gradients)
         return scaled, optax.ScaleByScheduleState(count=jnp.asarray(progress, jnp.int32) + 1)
 
-    return optax.GradientTransformationExtraArgs(init, update)
+    # optax's type of an update has no place for an argument that must be given.
+    return optax.GradientTransformationExtraArgs(init, update)  # pyright: ignore[reportArgumentType]

@@ -19,7 +19,7 @@ import jax.numpy as jnp
 from jaxpg import collectives
 from jaxpg.divergence import has_diverged
 from jaxpg.shapes import select
-from jaxpg.types import Metrics, Transition
+from jaxpg.types import Env, Metrics, Transition
 
 
 class VectorState(NamedTuple):
@@ -72,7 +72,7 @@ class VectorEnv(NamedTuple):
     episode_length: int
 
 
-def vectorize(env: Any, num_envs: int, episode_length: int) -> VectorEnv:
+def vectorize(env: Env, num_envs: int, episode_length: int) -> VectorEnv:
     """`num_envs` copies of `env`, whose episodes end after at most `episode_length` steps and are then reset.
 
     Args:

@@ -1,5 +1,6 @@
 """Shared by all tests: strict JAX settings, a compilation cache for the session, and how commands are run."""
 
+import gc
 import math
 import os
 import signal
@@ -10,6 +11,8 @@ from pathlib import Path
 
 import jax
 import pytest
+
+from jaxpg.program.allocator import trim
 
 jax.config.update("jax_debug_key_reuse", True)
 jax.config.update("jax_num_cpu_devices", 2)  # for the tests of shards
@@ -23,6 +26,7 @@ ROOT = Path(__file__).parent.parent
 
 SLOW = frozenset((ROOT / "tests" / "slow.txt").read_text(encoding="utf-8").split())  # files
 BEGAN = time.monotonic()
+MEMORY = 1e9  # bytes, beyond which a worker gives up what it has compiled
 
 
 def pytest_addoption(parser):
@@ -44,6 +48,24 @@ def pytest_runtest_setup(item):
     """On a machine that is many times slower than usual a part of the slow tests has to do."""
     if is_slow(item) and time.monotonic() - BEGAN > 60 * item.config.getoption("minutes"):
         pytest.skip("slow, and the time given with --minutes is over")
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _release_memory():
+    """JAX keeps all that was compiled, and glibc what was freed: by the last file a worker would hold gigabytes."""
+    yield
+    if resident_memory() > MEMORY:
+        jax.clear_caches()
+        gc.collect()
+        trim()
+
+
+def resident_memory():
+    """Bytes of this process in memory; 0 where the system does not say."""
+    try:
+        return int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
+    except OSError:
+        return 0
 
 
 @pytest.fixture(scope="session")

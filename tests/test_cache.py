@@ -220,7 +220,7 @@ def test_every_machine_has_its_folder(monkeypatch):
     names.add(machine())
     monkeypatch.setattr(executables, "cpu_features", lambda: b"flags: fpu")
     names.add(machine())
-    monkeypatch.setattr(executables.jaxlib, "__version__", "9.9.9")
+    monkeypatch.setattr(executables.jaxlib.version, "__version__", "9.9.9")
     names.add(machine())
     assert len(names) == 5
     assert machine().startswith("jaxlib-9.9.9-")

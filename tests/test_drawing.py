@@ -6,7 +6,7 @@ import pytest
 from scipy.spatial import ConvexHull
 
 from jaxpg.watch import drawing
-from jaxpg.watch.attempts import NotDrawn
+from jaxpg.watch.attempts import DrawingError
 
 MESH = """<asset><mesh name="wedge" vertex="0 0 0  1 0 0  0 1 0  0 0 1  .1 .1 .1"/></asset>"""
 
@@ -90,7 +90,7 @@ def test_a_body_without_geoms_is_drawn_as_the_box_that_has_its_inertia():
 
 
 def test_of_a_model_without_anything_it_is_said():
-    with pytest.raises(NotDrawn, match="no geoms and no bodies"):
+    with pytest.raises(DrawingError, match="no geoms and no bodies"):
         drawing.make_picture(
             mujoco.MjModel.from_xml_string('<mujoco><worldbody><geom type="plane" size="1 1 1"/></worldbody></mujoco>')
         )

@@ -11,7 +11,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from envs.physics import MujocoModelError, UnsupportedPrimitive, compile_step, step
+from envs.physics import MujocoModelError, UnsupportedPrimitiveError, compile_step, step
 from envs.physics.interpreter import trace
 from envs.physics.models import put_model
 from envs.physics.obstacles import colliding_geoms, obstacles
@@ -54,7 +54,7 @@ def test_a_glance_tells_what_tracing_tells(first, second):
         return
     try:
         trace(*_traced(model))
-    except UnsupportedPrimitive:
+    except UnsupportedPrimitiveError:
         assert obstacles(model)
     else:
         assert not obstacles(model)

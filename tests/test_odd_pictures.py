@@ -25,7 +25,7 @@ from jaxpg.program.state import Policy
 from jaxpg.store.folder import RunFolder
 from jaxpg.store.policies import make_stored_policy
 from jaxpg.watch import attempts, player, run_page
-from jaxpg.watch.attempts import NotDrawn, attempt
+from jaxpg.watch.attempts import DrawingError, attempt
 from jaxpg.watch.page import make_page
 from jaxpg.watch.untrained import make_untrained
 
@@ -234,7 +234,7 @@ def test_an_attempt_says_why_and_gives_nothing(monkeypatch):
         raise error
 
     assert attempt("picture", lambda: 3, said.append) == 3
-    for error in (NotDrawn("no geoms"), UserError("the disk is full")):
+    for error in (DrawingError("no geoms"), UserError("the disk is full")):
         assert attempt("picture", lambda error=error: raising(error), said.append) is None
     assert said == ["no picture: no geoms", "no picture: the disk is full"]
     with pytest.raises(KeyboardInterrupt):

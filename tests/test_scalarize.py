@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from jax import lax
 
 import envs
-from envs.physics import UnsupportedPrimitive, scalarize
+from envs.physics import UnsupportedPrimitiveError, scalarize
 from envs.physics.interpreter import CONTROL, trace
 from envs.physics.rules import RULES
 from envs.physics.trigonometry import sincos
@@ -50,7 +50,12 @@ CASES = {
     "min": [(lax.min, (V, W)), (lambda x: jnp.minimum(x, jnp.inf), (V,))],
     "clamp": [(lambda x: lax.clamp(-0.5, x, 0.5), (V,)), (lax.clamp, (W - 3, V, W))],
     "pow": [(lax.pow, (jnp.abs(V), W)), (lambda x: x ** jnp.float32(2), (V,)), (lambda x: x ** jnp.float32(-3), (V,))],
-    "integer_pow": [unary(lambda x: x**3), unary(lambda x: x**-2), unary(lambda x: x**4)],
+    "integer_pow": [
+        unary(lambda x: x**3),
+        unary(lambda x: x**-2),
+        unary(lambda x: x**4),
+        unary(lambda x: (1e-30 * x) ** -16),
+    ],
     "square": [unary(jnp.square)],
     "sqrt": [unary(lax.sqrt, jnp.abs(V))],
     "rsqrt": [unary(lax.rsqrt, jnp.abs(V))],
@@ -158,7 +163,11 @@ CASES = {
     "scatter-mul": [(lambda x, y: x.at[np.array([2, 0])].multiply(y[:2]), (V, W))],
     "scatter-min": [(lambda x, y: x.at[np.array([2, 0])].min(y[:2]), (V, W))],
     "scatter-max": [(lambda x, y: x.at[np.array([2, 0])].max(y[:2]), (V, W))],
-    "reduce_sum": [unary(lambda x: x.sum(1), A), unary(jnp.sum, A), unary(lambda x: x.sum(0) + x[:0].sum(0), A)],
+    "reduce_sum": [
+        unary(lambda x: x.sum(1), A),
+        unary(jnp.sum, A),
+        unary(lambda x: x.sum(0) + x[:0].sum(0), A),
+    ],
     "reduce_prod": [unary(lambda x: x.prod(0), A)],
     "reduce_max": [unary(lambda x: x.max(1), A)],
     "reduce_min": [unary(jnp.min, A)],
@@ -278,7 +287,7 @@ def test_cases_use_their_primitive(name):
     ],
 )
 def test_what_has_no_scalar_form_is_named(fn, args, name):
-    with pytest.raises(UnsupportedPrimitive, match=rf"^{name}: "):
+    with pytest.raises(UnsupportedPrimitiveError, match=rf"^{name}: "):
         scalarize(fn, *args)
 
 
@@ -308,6 +317,14 @@ def grow(children):
             lambda t: lambda xs: lax.select(t[0](xs) > 0.1, t[1](xs), t[2](xs)),
         ),
     )
+
+
+@pytest.mark.parametrize("reduce", [jnp.sum, jnp.prod, jnp.all, jnp.any, lambda x: x.sum(0).prod()])
+@pytest.mark.parametrize("shape", [(0,), (0, 3), (3, 0)])
+def test_reductions_of_no_elements_are_their_neutral_elements(reduce, shape):
+    nothing = jnp.zeros(shape)
+    found, expected = scalarize(reduce, nothing)(nothing), reduce(nothing)
+    assert (found, found.dtype, found.shape) == (expected, expected.dtype, ())
 
 
 @settings(deadline=None, max_examples=150)

@@ -43,9 +43,9 @@ def test_ten_times_the_usual_is_allowed(monkeypatch):
 
 
 def test_the_likely_cause_depends_on_jaxlib(monkeypatch):
-    monkeypatch.setattr(watchdog.jaxlib, "__version__", "0.10.1")
+    monkeypatch.setattr(watchdog.jaxlib.version, "__version__", "0.10.1")
     assert "PJRT_NPROC=1 or jaxlib 0.12 avoids it" in watchdog.describe_cause()
-    monkeypatch.setattr(watchdog.jaxlib, "__version__", "0.12.0")
+    monkeypatch.setattr(watchdog.jaxlib.version, "__version__", "0.12.0")
     assert "LAPACK" not in watchdog.describe_cause()
 
 

@@ -3,14 +3,14 @@
 from envs.physics.check import check_model, check_once, load_model
 from envs.physics.interpreter import scalarize
 from envs.physics.models import MujocoModelError, compile_model, ignored_features, load_spec
-from envs.physics.primitives import UnsupportedPrimitive
+from envs.physics.primitives import UnsupportedPrimitiveError
 from envs.physics.step import PHYSICS, compile_step
 from envs.physics.variants import differing_fields
 
 __all__ = [
     "PHYSICS",
     "MujocoModelError",
-    "UnsupportedPrimitive",
+    "UnsupportedPrimitiveError",
     "check_model",
     "check_once",
     "compile_model",

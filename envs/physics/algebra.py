@@ -10,6 +10,7 @@ vanish as a real function is still computed from it.
 from __future__ import annotations
 
 import math
+from typing import overload
 
 import numpy as np
 
@@ -17,6 +18,10 @@ from envs.physics.expressions import Expression, Scalar, build, is_constant, is_
 from envs.physics.folding import add_constants, fold, is_close
 
 
+@overload
+def split_coefficient(x: Expression) -> tuple[float, Expression]: ...
+@overload
+def split_coefficient(x: Scalar) -> tuple[float, Scalar]: ...
 def split_coefficient(x: Scalar) -> tuple[float, Scalar]:
     """(c, y) with x = c y, c a constant and y without one."""
     if is_operation(x, "neg"):
@@ -27,6 +32,10 @@ def split_coefficient(x: Scalar) -> tuple[float, Scalar]:
     return 1, x
 
 
+@overload
+def split_constant(x: Expression) -> tuple[float, Expression]: ...
+@overload
+def split_constant(x: Scalar) -> tuple[float, Scalar]: ...
 def split_constant(x: Scalar) -> tuple[float, Scalar]:
     """(c, y) with x = c + y, c a constant and y without one."""
     if is_operation(x, "add") and is_constant(x.args[0]):
@@ -39,6 +48,10 @@ def split_constant(x: Scalar) -> tuple[float, Scalar]:
 # --- sums -------------------------------------------------------------------------------------------------------------
 
 
+@overload
+def neg(x: Expression) -> Expression: ...
+@overload
+def neg(x: Scalar) -> Scalar: ...
 def neg(x: Scalar) -> Scalar:
     """-x; -(-x) = x, -(x - y) = y - x, -(c + x) = -c - x."""
     if is_constant(x):
@@ -54,12 +67,10 @@ def neg(x: Scalar) -> Scalar:
 
 def add(x: Scalar, y: Scalar) -> Scalar:
     """x + y, as a difference where one of them is negative; constants are collected, common factors taken out."""
-    if is_constant(x) and is_constant(y):
-        return x + y
-    if is_constant(y):
-        x, y = y, x
     if is_constant(x):
         return _shift(x, y)
+    if is_constant(y):
+        return _shift(y, x)
     (a, u), (b, v) = split_constant(x), split_constant(y)
     if not (is_number(a, 0) and is_number(b, 0)):
         return _shift(add_constants(a, b, x.dtype), add(u, v))
@@ -73,11 +84,11 @@ def add(x: Scalar, y: Scalar) -> Scalar:
 
 def sub(x: Scalar, y: Scalar) -> Scalar:
     """x - y = x + (-y), written as a difference."""
-    if is_constant(x) and is_constant(y):
-        return x - y
+    if is_constant(x):
+        return x - y if is_constant(y) else add(x, neg(y))
     if x is y:
         return x.dtype.type(0).item()
-    if is_constant(x) or is_constant(y) or is_operation(y, "neg"):
+    if is_constant(y) or is_operation(y, "neg"):
         return add(x, neg(y))
     (a, u), (b, v) = split_constant(x), split_constant(y)
     if not (is_number(a, 0) and is_number(b, 0)):
@@ -121,14 +132,13 @@ def _common_factor(x: Expression, y: Expression, sign: int) -> Scalar | None:
 
 def mul(x: Scalar, y: Scalar) -> Scalar:
     """x y, with the sign and the constant factor outermost; products of sines and cosines of one angle are linear."""
-    if is_constant(x) and is_constant(y):
-        return x * y
-    if is_constant(y):
-        x, y = y, x
     if is_constant(x):
-        return _scale(x, y)
+        return x * y if is_constant(y) else _scale(x, y)
+    if is_constant(y):
+        return _scale(y, x)
     (a, u), (b, v) = split_coefficient(x), split_coefficient(y)
-    return _scale(a * b, _double_angle(u, v) or build("mul", u, v))
+    identity = _double_angle(u, v)
+    return _scale(a * b, build("mul", u, v)) if identity is None else mul(a * b, identity)
 
 
 def _scale(c: float, y: Expression) -> Scalar:
@@ -154,15 +164,16 @@ def div(x: Scalar, y: Scalar) -> Scalar:
     if not (_is_floating(x) or _is_floating(y)):
         return build("div", x, y)
     if is_constant(y):
+        if is_constant(x):
+            return fold("div", x, y, dtype=np.dtype(float))
         return _scale(1 / y, x) if y != 0 else build("div", x, y)
-    if is_number(x, 0):
-        return x
-    (a, u), (b, v) = split_coefficient(x), split_coefficient(y)
-    if u is v:
-        return a / b
-    if is_constant(u):
-        return _scale(u * a / b, div(v.args[1], v.args[0]) if v.op == "div" else build("div", 1.0, v))
-    return _scale(a / b, build("div", u, v))
+    b, v = split_coefficient(y)
+    if is_constant(x):
+        if x == 0:
+            return x
+        return mul(x / b, div(v.args[1], v.args[0])) if v.op == "div" else _scale(x / b, build("div", 1.0, v))
+    a, u = split_coefficient(x)
+    return a / b if u is v else _scale(a / b, build("div", u, v))
 
 
 def _is_floating(x: Scalar) -> bool:
@@ -211,10 +222,10 @@ def _is_negative(x: Expression) -> bool:
 
 def _angle_sum(u: Expression, v: Expression, sign: int) -> Scalar | None:
     """cos a cos b -+ sin a sin b = cos(a +- b), sin a cos b +- cos a sin b = sin(a +- b), or None."""
-    pairs = _sines_and_cosines(u), _sines_and_cosines(v)
-    if None in pairs:
+    left, right = _sines_and_cosines(u), _sines_and_cosines(v)
+    if left is None or right is None:
         return None
-    ((first, a), (second, b)), ((third, c), (fourth, d)) = pairs
+    ((first, a), (second, b)), ((third, c), (fourth, d)) = left, right
     if {a, b} != {c, d}:
         return None
     kinds = first + second, third + fourth

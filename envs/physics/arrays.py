@@ -6,6 +6,8 @@ every place. Moving elements about is the same for both.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from envs.physics.expressions import Expression
@@ -40,7 +42,7 @@ def pack(elements: list, shape: tuple[int, ...]) -> Array:
     return array.reshape(shape)
 
 
-def choose_array(index: Expression, cases: list[Array], aval) -> Array:
+def choose_array(index: Expression, cases: Sequence[Array], aval) -> Array:
     """cases[index], the index clamped into the range."""
     options = zip(*(as_objects(case).flat for case in cases), strict=True)
     return pack([choose(index, *option, dtype=np.dtype(aval.dtype)) for option in options], aval.shape)

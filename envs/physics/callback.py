@@ -57,10 +57,10 @@ def callback_step(
         simulations.step(list(map(np.asarray, arrays)), list(map(np.asarray, results)))
 
     def step(*arrays):
-        types, method = types_of(model, outputs), {"vmap_method": "broadcast_all"}
+        types = types_of(model, outputs)
         make = functools.partial(simulations.results, types)
-        here = buffer_callback(fill, types, **method)
-        elsewhere = functools.partial(jax.pure_callback, make, types, **method)
+        here = buffer_callback(fill, types, vmap_method="broadcast_all")
+        elsewhere = functools.partial(jax.pure_callback, make, types, vmap_method="broadcast_all")
         return tuple(jax.lax.platform_dependent(*arrays, cpu=here, default=elsewhere))
 
     return step
@@ -91,9 +91,9 @@ class Simulations:
 
     def results(self, types: Sequence[jax.ShapeDtypeStruct], *arrays: jax.Array) -> list[np.ndarray]:
         """The outputs of all environments, from the inputs of all: leading axes are theirs."""
-        arrays = tuple(map(np.asarray, arrays))
-        found = [np.empty((*self._leading(arrays), *x.shape), x.dtype) for x in types]
-        self.step(arrays, found)
+        given = tuple(map(np.asarray, arrays))
+        found = [np.empty((*self._leading(given), *x.shape), x.dtype) for x in types]
+        self.step(given, found)
         return found
 
     def step(self, arrays: Sequence[np.ndarray], results: Sequence[np.ndarray]) -> None:
@@ -114,8 +114,8 @@ class Simulations:
         sound = np.all([_sound(name, values) for name, values in zip(self._inputs, rows, strict=True)], 0)
         batch.step(sound, self._num_substeps)
         sound &= ~has_diverged(batch.warning[..., 1])
-        for name, result in zip(self._outputs, results, strict=True):
-            result = result.reshape(len(sound), -1)
+        for name, array in zip(self._outputs, results, strict=True):
+            result = array.reshape(len(sound), -1)
             result[...] = _field(batch, name)
             result[~sound] = np.nan if result.dtype.kind == "f" else 0
 
@@ -154,10 +154,10 @@ def _sound(name: str, values: np.ndarray) -> np.ndarray:
     import mujoco
 
     within = np.abs(values) <= mujoco.mjMAXVAL if name in ("qpos", "qvel") else ~np.isnan(values)
-    return within.all(1)
+    return np.all(within, 1)
 
 
-def has_diverged(counts: np.ndarray) -> np.ndarray:
+def has_diverged(counts: np.ndarray) -> np.ndarray | np.bool:
     """Whether MuJoCo says so, by its counts of warnings `[..., kinds]`, all of which began with `COUNTED`."""
     import mujoco
 

@@ -8,10 +8,14 @@ as it is written; `envs.physics.primitives.apply` simplifies it first.
 from __future__ import annotations
 
 import math
-from typing import Union
+from typing import TYPE_CHECKING, TypeGuard, Union
 
 import numpy as np
 
+if TYPE_CHECKING:
+    from typing_extensions import TypeIs  # in `typing` from Python 3.13 on
+
+Constant = float | int | bool
 Scalar = Union["Expression", float, int, bool]
 
 COMMUTATIVE = frozenset({"add", "mul", "max", "min", "and", "or", "xor", "eq", "ne"})
@@ -79,16 +83,16 @@ def _order(x: Scalar) -> int:
     return x.index if isinstance(x, Expression) else -1
 
 
-def is_constant(x: Scalar) -> bool:
+def is_constant(x: Scalar) -> TypeIs[Constant]:
     """Whether x is a number."""
     return not isinstance(x, Expression)
 
 
-def is_number(x: Scalar, value: float) -> bool:
+def is_number(x: Scalar, value: float) -> TypeGuard[Constant]:
     """Whether x is this number."""
     return is_constant(x) and x == value
 
 
-def is_operation(x: Scalar, op: str) -> bool:
+def is_operation(x: Scalar, op: str) -> TypeGuard[Expression]:
     """Whether x is an expression of this operation."""
     return isinstance(x, Expression) and x.op == op

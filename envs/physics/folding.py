@@ -12,7 +12,7 @@ import numpy as np
 ROUNDING = 4
 
 
-def fold(op: str, *args, dtype: np.dtype, params: tuple = ()):
+def fold(op: str, *args: Any, dtype: np.dtype, params: tuple = ()) -> Any:
     """The value of a primitive on numpy arrays or Python numbers; of the latter a Python number."""
     with np.errstate(all="ignore"):
         value = np.asarray(NUMPY[op](*args, **dict(params)), dtype=dtype)
@@ -87,8 +87,8 @@ NUMPY: dict[str, Callable[..., Any]] = {
     "xor": np.bitwise_xor,
     "not": np.invert,
     "nextafter": np.nextafter,
-    "select_n": lambda which, *cases: (
-        np.choose(which, cases) if len(cases) > 2 else np.where(which, cases[1], cases[0])
+    "select_n": lambda which, off, on, *others: (
+        np.choose(which, (off, on, *others)) if others else np.where(which, on, off)
     ),
     "convert_element_type": lambda x, new_dtype: x,
     "clamp": lambda low, x, high: np.minimum(np.maximum(x, low), high),

@@ -9,7 +9,7 @@ which under `vmap` are operations on contiguous vectors of the batch.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import jax
@@ -18,7 +18,7 @@ import numpy as np
 
 from envs.physics.arrays import as_objects, choose_array, is_numeric, pack, promote
 from envs.physics.expressions import Expression, Graph
-from envs.physics.primitives import UnsupportedPrimitive
+from envs.physics.primitives import UnsupportedPrimitiveError
 from envs.physics.rules import RULES
 from envs.physics.stages import Stage, in_kernels, in_order, make_stages, run, separately
 
@@ -35,8 +35,8 @@ def scalarize(fn: Callable, *example_args: Any) -> Callable:
       differentiated. Its attribute `program` is the `Program`.
 
     Raises:
-      UnsupportedPrimitive: `fn` uses something that has no scalar form (a loop whose length depends on the data, an
-        index that does); the message names the primitive.
+      UnsupportedPrimitiveError: `fn` uses something that has no scalar form (a loop whose length depends on the
+        data, an index that does); the message names the primitive.
     """
     program = trace(fn, *example_args)
 
@@ -93,7 +93,7 @@ class Program:
     def _computed(self) -> list[Expression]:
         return [x for x in self._results if isinstance(x, Expression)]
 
-    def split(self, leaves: list) -> list[jax.Array]:
+    def split(self, leaves: Sequence) -> list[jax.Array]:
         """The elements of the arguments' leaves, in order."""
         return self._split(*leaves)
 
@@ -107,7 +107,7 @@ class Program:
             for x, dtype in zip(self._results, dtypes, strict=True)
         ]
 
-    def join(self, elements: list[jax.Array]) -> list[jax.Array]:
+    def join(self, elements: Sequence[jax.Array]) -> list[jax.Array]:
         """The result's leaves from their elements."""
         leaves, begin = [], 0
         for array, dtype in zip(self.outputs, self.output_dtypes, strict=True):
@@ -178,7 +178,7 @@ def interpret(equation, operands: list, wanted: list[bool]) -> list:
     if name in CONTROL:
         return CONTROL[name](operands, wanted, **params)
     if name not in RULES:
-        raise UnsupportedPrimitive(f"{name}: no scalar rule")
+        raise UnsupportedPrimitiveError(f"{name}: no scalar rule")
     results = RULES[name](equation.outvars[0].aval, *operands, **params)
     results = results if isinstance(results, tuple) else (results,)
     return [_settle(result, var.aval.dtype) for result, var in zip(results, equation.outvars, strict=True)]
@@ -223,7 +223,7 @@ def _scan(operands, wanted, *, jaxpr, length, reverse, **groups):
     return [*carry, *stacked]
 
 
-def _scan_operands(operands, *, num_consts=None, num_carry=None, ft_in=None, **_):
+def _scan_operands(operands, *, num_consts=0, num_carry=0, ft_in=None, **_):
     """(consts, carry, xs): by their numbers, or from jax 0.12 on by a tree that has them as its branches."""
     if ft_in is not None:
         return map(list, ft_in.update(operands).unpack())
@@ -250,7 +250,7 @@ def _while(operands, wanted, *, cond_nconsts, cond_jaxpr, body_nconsts, body_jax
     while True:
         (go_on,) = evaluate(cond_jaxpr.jaxpr, cond_jaxpr.consts, [*cond_consts, *carry])
         if not is_numeric(go_on):
-            raise UnsupportedPrimitive("while: the number of rounds depends on the data")
+            raise UnsupportedPrimitiveError("while: the number of rounds depends on the data")
         if not go_on:
             return carry
         carry = evaluate(body_jaxpr.jaxpr, body_jaxpr.consts, [*body_consts, *carry])

@@ -84,7 +84,7 @@ def model_digest(model: mujoco.MjModel) -> bytes:
 
     content = np.empty(mujoco.mj_sizeModel(model), np.uint8)
     mujoco.mj_saveModel(model, None, content)
-    return hashlib.sha256(content).digest()
+    return hashlib.sha256(content.data).digest()
 
 
 def put_model(model: mujoco.MjModel):

@@ -9,11 +9,11 @@ from typing import Any
 import numpy as np
 
 from envs.physics.algebra import add, cos, div, integer_pow, mul, neg, power, sin, sub
-from envs.physics.expressions import Scalar, build, identity, is_constant, is_number, is_operation
+from envs.physics.expressions import Expression, Scalar, build, identity, is_constant, is_number, is_operation
 from envs.physics.folding import fold
 
 
-class UnsupportedPrimitive(ValueError):
+class UnsupportedPrimitiveError(ValueError):
     """A primitive, or a use of one, that has no scalar form; the message begins with its name."""
 
 
@@ -44,7 +44,7 @@ def select(which: Scalar, on_false: Scalar, on_true: Scalar, *others: Scalar, dt
     return build("select_n", which, on_false, on_true, dtype=dtype)
 
 
-def choose(index: Scalar, *cases: Scalar, dtype: np.dtype) -> Scalar:
+def choose(index: Scalar, *cases: Scalar, dtype: np.dtype | None) -> Scalar:
     """cases[index], the index clamped into the range."""
     chosen = cases[0]
     for at, case in enumerate(cases[1:], start=1):
@@ -89,12 +89,12 @@ def logical_or(x: Scalar, y: Scalar) -> Scalar:
     return True if y is True else build("or", x, y)
 
 
-def logical_not(x: Scalar) -> Scalar:
+def logical_not(x: Expression) -> Scalar:
     """not x, of a truth value or bit by bit; not not x = x."""
     return x.args[0] if x.op == "not" else build("not", x)
 
 
-def convert(x: Scalar, new_dtype: np.dtype) -> Scalar:
+def convert(x: Expression, new_dtype: np.dtype) -> Scalar:
     """x in another dtype; nothing happens where it has that one."""
     if x.dtype == new_dtype:
         return x

@@ -21,7 +21,7 @@ from envs.physics.fields import MODEL, STATE, as_arguments, check_names, types_o
 from envs.physics.interpreter import Program, trace
 from envs.physics.models import import_mjx, model_digest, model_name, put_model
 from envs.physics.obstacles import likely_obstacles, obstacles
-from envs.physics.primitives import UnsupportedPrimitive
+from envs.physics.primitives import UnsupportedPrimitiveError
 from envs.physics.stages import Stage
 from envs.physics.storage import kept, name_of
 from envs.physics.tiles import in_tiles
@@ -95,7 +95,7 @@ def scalar_step(model: mujoco.MjModel, num_substeps: int, inputs: tuple[str, ...
     try:
         program = scalar_program(model, inputs, outputs)
         return in_tiles(program, functools.partial(_program_step, program, inputs, _carried(inputs), num_substeps))
-    except UnsupportedPrimitive as error:
+    except UnsupportedPrimitiveError as error:
         _warn_once(model, "; ".join(likely_obstacles(model)) or str(error))
     return mjx_step(_without_lapack(model), num_substeps, inputs, outputs)
 
@@ -119,15 +119,16 @@ def _carried(inputs: tuple[str, ...]) -> tuple[str, ...]:
 
 
 def scalar_program(model: mujoco.MjModel, inputs: tuple[str, ...], outputs: tuple[str, ...]) -> Program:
-    """One physics step as scalar equations, kept if `storage.kept_in` says where; UnsupportedPrimitive if it has none.
+    """One physics step as scalar equations, kept if `storage.kept_in` says where; then MJX is not even imported.
 
-    Where it is kept, MJX is not even imported.
+    Raises:
+      UnsupportedPrimitiveError: it has no such form.
     """
 
     def make():
         found = obstacles(model)
         if found and "qpos" in inputs and "qvel" in outputs:
-            raise UnsupportedPrimitive("; ".join(found))
+            raise UnsupportedPrimitiveError("; ".join(found))
         step, example = single_step(model, inputs, outputs)
         return trace(step, *example)
 

@@ -67,7 +67,7 @@ def kept(name: str, make: Callable[[], Program]) -> Program:
 def name_of(model: mujoco.MjModel, inputs: tuple[str, ...], outputs: tuple[str, ...]) -> str:
     """A name for the program of a model's step, other than that of any program that may differ from it."""
     return hashlib.sha256(
-        model_digest(model) + repr((inputs, outputs, jax.config.jax_enable_x64, *_makers())).encode()
+        model_digest(model) + repr((inputs, outputs, jax.config.values["jax_enable_x64"], *_makers())).encode()
     ).hexdigest()
 
 
@@ -115,10 +115,10 @@ def from_text(text: str) -> Program:
     def array(shape: list[int], elements: list) -> np.ndarray:
         return pack([element(x) for x in elements], tuple(shape))
 
-    for op, args, params, dtype in content["expressions"]:
+    for op, operands, params, dtype in content["expressions"]:
         if op != "input" and op not in NUMPY:
             raise ValueError(f"{op} is no operation of scalar equations")
-        args = tuple(map(element, args))
+        args = tuple(map(element, operands))
         expressions.append(Expression(graph, op, args, _parameters(params), np.dtype(dtype)))
     outputs = [array(shape, elements) for shape, elements, _ in content["outputs"]]
     return Program(

@@ -16,6 +16,7 @@ from collections.abc import Callable
 import jax
 import jax.numpy as jnp
 from jax import lax
+from jax.core import ShapedArray
 from jax.extend.core import Primitive
 from jax.interpreters import ad, batching, mlir
 
@@ -83,7 +84,7 @@ def _tiled(*arrays, function, for_tiles, is_batched, **_):
 
 def _shapes(*arrays, results, is_batched, **_):
     batch = arrays[0].shape[:1] if is_batched else ()
-    return [jax.core.ShapedArray((*batch, *x.shape), x.dtype) for x in results]
+    return [ShapedArray((*batch, *x.shape), x.dtype) for x in results]
 
 
 def _batch(arrays, axes, *, is_batched, **params):

@@ -53,9 +53,9 @@ def _(primals, tangents):
     return (sin, cos), (cos * dx, -sin * dx)
 
 
-def _polynomial(coefficients: tuple[float, ...], x: jax.Array) -> jax.Array:
+def _polynomial(coefficients: tuple[float, ...], x: jax.Array) -> jax.Array | np.float32:
     """c_0 + c_1 x + c_2 x^2 + ..., by Horner's rule."""
-    result = np.float32(coefficients[-1])
+    result: jax.Array | np.float32 = np.float32(coefficients[-1])
     for coefficient in reversed(coefficients[:-1]):
         result = result * x + np.float32(coefficient)
     return result

@@ -41,7 +41,7 @@ def run_command(main: Callable[[Sequence[str]], int | None]) -> None:
             print("interrupted", file=sys.stderr)
             status, interrupted = INTERRUPTED, True
     if interrupted and threading.active_count() > 1:
-        os._exit(status)  # XLA cannot be interrupted while it compiles, and Python would wait for its threads
+        os._exit(INTERRUPTED)  # XLA cannot be interrupted while it compiles, and Python would wait for its threads
     gc.freeze()  # without this, the last garbage collections of the interpreter take half a second
     sys.exit(status)
 
@@ -63,8 +63,9 @@ class UnbreakableStream:
     def __init__(self, stream: TextIO | None, descriptor: int):
         self._stream = open(os.devnull, "w", encoding="utf-8") if stream is None else stream  # noqa: SIM115
         self._descriptor = descriptor
-        if hasattr(self._stream, "reconfigure"):
-            self._stream.reconfigure(errors="backslashreplace")
+        reconfigure = getattr(self._stream, "reconfigure", None)
+        if reconfigure is not None:
+            reconfigure(errors="backslashreplace")
 
     def write(self, text: str) -> int:
         return self._try(self._stream.write, text)

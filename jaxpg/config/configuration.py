@@ -117,6 +117,7 @@ def split_sweep(values: Mapping[str, Any]) -> tuple[dict[str, Any], dict[str, An
 
 
 def check_choices(choices: Mapping[str, Any]) -> None:
+    """Raises OptionError for a member of a group that does not exist, with the nearest one."""
     names = {group: str(choice) for group, choice in choices.items()}
     problems = [
         describe_unknown(group, name, GROUPS[group]) for group, name in names.items() if name not in GROUPS[group]
@@ -172,7 +173,7 @@ def change(config: Config, changes: Mapping[str, Any]) -> Config:
     Raises:
       OptionError: an unknown name, another member of a group, a wrong type or a value out of range.
     """
-    check_choices(config.choices | select_choices(changes))
+    check_choices({**config.choices, **select_choices(changes)})
     others = [name for name in GROUPS if changes.get(name, config.choices[name]) != config.choices[name]]
     if others:
         raise OptionError([f"{name}={changes[name]}: the run has {name}={config.choices[name]}" for name in others])

@@ -96,7 +96,7 @@ def _find_excessive_sizes(run: Run, algo: Any, horizon: int) -> Iterator[str]:
         yield f"env.episode_length={horizon}: it must be at least 1"
     if horizon >= 2**31:
         yield f"env.episode_length={horizon}: it must stay below 2**31"
-    rollout = run.num_envs * run.num_steps
+    rollout = run.num_envs * run.rollout_steps
     if rollout >= 2**31:
         yield f"num_envs={run.num_envs} num_steps={run.num_steps}: their product must stay below 2**31"
         return

@@ -34,11 +34,8 @@ def format_train_help(arguments: Sequence[str]) -> str:
     for group in ("", *GROUPS):
         schema = GROUPS[group][config.choices[group]] if group else Run
         names = [name for name in fields if name.rpartition(".")[0] == group]
-        lines += [
-            "",
-            schema.__doc__.splitlines()[0],
-            *(_format_line(name, values[name], fields[name]) for name in names),
-        ]
+        about = (schema.__doc__ or schema.__name__).splitlines()[0]
+        lines += ["", about, *(_format_line(name, values[name], fields[name]) for name in names)]
     names = ", ".join(find_sweepable_options(config.choices))
     lines += ["", *textwrap.wrap(f"{SWEEP} {names}.", width=120)]
     lines += ["", "The defaults are those of the environment and algorithm above; for others, add env=... or algo=..."]

@@ -79,9 +79,11 @@ def find_program(env: str) -> dict[str, str]:
     """The entry for config.yaml: the running program, if it registered the environment; else empty."""
     main = sys.modules["__main__"]
     module, path = getattr(main, "__spec__", None), getattr(main, "__file__", None)
-    if env in envs.SHIPPED or not (module or path):
+    if env in envs.SHIPPED:
         return {}
-    return {PROGRAM: f"-m {module.name}" if module else os.path.abspath(path)}
+    if module:
+        return {PROGRAM: f"-m {module.name}"}
+    return {PROGRAM: os.path.abspath(path)} if path else {}
 
 
 def format_command(env: str, verb: str) -> str:

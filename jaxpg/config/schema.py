@@ -24,7 +24,7 @@ LOGGERS = ("wandb", "mlflow")  # besides TensorBoard
 LARGEST = 2**31 - 1  # size of an array's axis: XLA's indices are 32-bit numbers
 
 
-def number(default: float | None, help: str, **bounds: float) -> Any:
+def number(default: float | None, help: str, **bounds: Any) -> Any:
     """An option that can be swept: its value only enters formulas, so it can be an argument of the compiled program.
 
     Args:
@@ -186,3 +186,9 @@ class Run:
     loggers: list[str] = option([], "loggers besides TensorBoard", choices=LOGGERS)
     cache: bool = option(True, "keep compiled programs in the user's cache folder")
     report: bool = option(True, "write report.html at the end, with curves and episodes")
+
+    @property
+    def rollout_steps(self) -> int:
+        """`num_steps`, which is set in every checked configuration."""
+        assert self.num_steps is not None
+        return self.num_steps

@@ -160,15 +160,15 @@ int main(void) {
 """
 
 
-def make_code(controller: Controller) -> str:
+def make_code(controller: Controller, learner: Learner) -> str:
     """The second part of the header, about a controller called `policy`."""
-    options = controller.learner.options
+    options = learner.options
     return CODE.format(
         size=len(controller.layers[0].weight),
         scale=f"{options.reward_scale:g}",
         discounted="gamma^t" if options.discounted else "1",
-        sigma=", log sigma" if controller.learner.learns_sigma else "",
-        learn_sigma=LEARN_SIGMA if controller.learner.learns_sigma else "",
+        sigma=", log sigma" if learner.learns_sigma else "",
+        learn_sigma=LEARN_SIGMA if learner.learns_sigma else "",
         factor="gamma" if options.discounted else "1",
     )
 

@@ -134,8 +134,8 @@ def _check_name(name: str) -> str:
 def _normalize_interface(interface: Interface) -> Interface:
     """The interface as tuples of printable strings and of floats."""
     names, commands, limits = interface
-    texts = (tuple(escape_text(str(text)) for text in names) for names in (names, commands))
-    return Interface(*texts, None if limits is None else tuple(float(x) for x in limits))
+    names, commands = (tuple(escape_text(str(text)) for text in texts) for texts in (names, commands))
+    return Interface(names, commands, None if limits is None else tuple(float(x) for x in limits))
 
 
 def _check_numbers(controller: Controller) -> None:

@@ -16,7 +16,14 @@ import numpy as np
 from envs.hints import pip_install
 from jaxpg.config.command_options import ExportOptions
 from jaxpg.deploy import c, learner_replay, onnx, reference, sealing, stablehlo
-from jaxpg.deploy.controller import Controller, draw_observations, make_command, make_controller, play_observations
+from jaxpg.deploy.controller import (
+    Controller,
+    Learner,
+    draw_observations,
+    make_command,
+    make_controller,
+    play_observations,
+)
 from jaxpg.errors import UserError
 from jaxpg.program.agents import described
 from jaxpg.program.networks import make_networks
@@ -108,11 +115,12 @@ def export(options: ExportOptions, say: Callable[[str], None]) -> None:
     formats = FORMATS if options.format == "all" else {options.format: FORMATS[options.format]}
     for target in formats.values():
         target.check()
+    assert options.run is not None  # the command has asked for it
     out = Path(options.out or Path(options.run) / "export")
     sealing.check_folder(out)
     with physics_cache(True):
         stored = policies.load(options.run, options.checkpoint, options.agent)
-    control = make_controller(stored, describe_origin(options, stored), options.name)
+    control = make_controller(stored, describe_origin(options.run, options.checkpoint, stored), options.name)
     command = jax.jit(make_command(stored))
     played = play_observations(stored)
     trial = make_trial(control, np.concatenate([played, draw_observations(stored, played)]))
@@ -126,7 +134,7 @@ def export(options: ExportOptions, say: Callable[[str], None]) -> None:
             all_paths += paths
             say(f"{name:<10} error {error:.1e} at most: {' '.join(str(out / path.name) for path in paths)}")
             if name == "c" and control.learner:
-                say(f"{'':<10} {_check_learner(stored, control, Path(place))}")
+                say(f"{'':<10} {_check_learner(stored, control, control.learner, Path(place))}")
         if not options.overwrite:
             sealing.check_replaceable([path.name for path in all_paths], out)
         sealing.move_into(all_paths, out)
@@ -156,7 +164,7 @@ def _check_error(control: Controller, what: str, trial: Trial, commands: np.ndar
     return error
 
 
-def _check_learner(stored: StoredPolicy, control: Controller, place: Path) -> str:
+def _check_learner(stored: StoredPolicy, control: Controller, learner: Learner, place: Path) -> str:
     """Compares the exported learner's parameters with JAX's after each of the same steps; returns a line on the result.
 
     The tolerance is the larger of `LEARNING_TOLERANCE` and `ROUNDING_FACTOR` times the effect of rounding up to that
@@ -168,7 +176,7 @@ def _check_learner(stored: StoredPolicy, control: Controller, place: Path) -> st
     transition = learner_replay.collect_steps(stored)
     if not len(transition.reward):
         return "learning not tested: no episode that was played can be learned from"
-    networks, learner = make_networks(stored.config, stored.env), control.learner
+    networks = make_networks(stored.config, stored.env)
     learn = functools.partial(learner_replay.learn, networks, learner.options, stored.policy, learner.log_std)
     expected = np.asarray(learn(transition))
     parameters = c.compile_example(control, place / "learn.c")(learner_replay.to_rows(transition))
@@ -214,12 +222,12 @@ def replace_by_export(stored: StoredPolicy, form: str) -> Iterator[StoredPolicy]
         yield stored._replace(act=act)
 
 
-def describe_origin(options: ExportOptions, stored: StoredPolicy) -> dict[str, str]:
+def describe_origin(run: str, checkpoint: str, stored: StoredPolicy) -> dict[str, str]:
     """A description of where the policy comes from."""
-    run_folder = folder.find(options.run)
-    which = run_folder.best if options.checkpoint == "best" else run_folder.checkpoints
+    run_folder = folder.find(run)
+    which = run_folder.best if checkpoint == "best" else run_folder.checkpoints
     return {
-        "policy": f"{described(stored.config)}, {stored.describe(options.checkpoint)}",
+        "policy": f"{described(stored.config)}, {stored.describe(checkpoint)}",
         "run": run_folder.path.resolve().name,
         "digest": Checkpoints(which, read_only=True).digest(stored.update),
     }

@@ -165,7 +165,7 @@ def make_header(controller: Controller) -> str:
         features=_make_features(controller),
         layers=_make_layers(controller),
         action="POLICY_F(tanh)(u[i])" if controller.squash else "u[i]",
-        more=c_learner.make_code(controller) if controller.learner else "",
+        more=c_learner.make_code(controller, controller.learner) if controller.learner else "",
         farthest=MAX_DEVIATION,
         command="a" if limits is None else "policy_limit[i] * (a > 1 ? 1 : a < -1 ? -1 : a)",
     )

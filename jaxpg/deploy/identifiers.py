@@ -30,10 +30,10 @@ def make_identifier(name: str) -> str:
 
 
 def escape_text(text: str) -> str:
-    """The text on one line and encodable: characters that cannot be printed are escaped.
+    r"""The text on one line and encodable: characters that cannot be printed are escaped.
 
-    >>> print(escape_text("angle [°]\\nsecond line"))
-    angle [°]\\nsecond line
+    >>> print(escape_text("angle [°]\nsecond line"))
+    angle [°]\nsecond line
     """
     return "".join(x if x.isprintable() else x.encode("unicode_escape").decode() for x in text)
 

@@ -72,7 +72,8 @@ def learn(
         return jnp.concatenate([weight.T.ravel(), bias, sigma, value["kernel"].ravel(), value["bias"]])
 
     def step(carry, transition):
-        params, traces, _ = update(*carry, policy.normalizer, transition)
+        params, traces = carry
+        params, traces, _ = update(params, traces, policy.normalizer, transition, True)
         return (params, traces), flat(params)
 
     def replay(params, transition):

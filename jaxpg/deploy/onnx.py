@@ -77,7 +77,7 @@ def load(controller: Controller, folder: Path) -> Callable[[np.ndarray], np.ndar
 
     path = str(folder / f"{controller.name}.onnx")
     session = onnxruntime.InferenceSession(path, providers=["CPUExecutionProvider"])
-    return lambda obs: session.run(["command"], {"observation": obs})[0]
+    return lambda obs: np.asarray(session.run(["command"], {"observation": obs})[0])
 
 
 def _add_command(graph: Graph, controller: Controller) -> None:
@@ -98,7 +98,7 @@ def _clip(graph: Graph, action: str, limits: tuple[float, ...]) -> str:
     return graph.node("Mul", graph.node("Clip", action, graph.constant(-1), graph.constant(1)), graph.constant(limits))
 
 
-def _is_within(graph: Graph, x: str, bound: float) -> str:
+def _is_within(graph: Graph, x: str, bound: float | np.floating) -> str:
     """Whether all |x| of a row are at most `bound`, `[batch, 1]`; false for NaN."""
     small = graph.node("LessOrEqual", graph.node("Abs", x), graph.constant(bound))
     smallest = graph.node("ReduceMin", graph.node("Cast", small, to=FLOAT), graph.constant([1], np.int64), keepdims=1)
@@ -135,17 +135,18 @@ def _fourier(graph: Graph, z: str, controller: Controller) -> str:
 def _radial(graph: Graph, z: str, controller: Controller) -> str:
     order = controller.order
     axis, width = np.linspace(-BOUND, BOUND, order), 2 * BOUND / (order - 1)
-    bumps = None
-    for i in range(controller.observation_size):
+
+    def bump(i: int) -> str:
         distance = graph.node(
             "Div", graph.node("Sub", graph.columns(z, [i]), graph.constant(axis)), graph.constant(width)
         )
         energy = graph.node("Mul", graph.node("Mul", distance, distance), graph.constant(-0.5))
-        bump = graph.node("Softmax", energy, axis=1)
-        if bumps is None:
-            bumps = bump
-            continue
-        one, two = (graph.node("Unsqueeze", x, graph.constant([axis], np.int64)) for x, axis in ((bumps, 2), (bump, 1)))
+        return graph.node("Softmax", energy, axis=1)
+
+    bumps = bump(0)
+    for i in range(1, controller.observation_size):
+        pair = (bumps, 2), (bump(i), 1)
+        one, two = (graph.node("Unsqueeze", x, graph.constant([axis], np.int64)) for x, axis in pair)
         bumps = graph.node("Reshape", graph.node("Mul", one, two), graph.constant([-1, order ** (i + 1)], np.int64))
     return bumps
 

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import jax
@@ -64,7 +64,7 @@ class Policy:
         return obs
 
 
-def load(run: str | Path, checkpoint: str = "best", agent: int | None = None) -> Policy:
+def load(run: str | os.PathLike[str], checkpoint: str = "best", agent: int | None = None) -> Policy:
     """A policy from a run folder; see `jaxpg.load`."""
     if checkpoint not in CHECKPOINTS:
         raise UserError(f"checkpoint={checkpoint}: must be {' or '.join(CHECKPOINTS)}")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import itertools
 import math
 
@@ -109,7 +110,7 @@ def _radial(z: np.ndarray, order: int) -> np.ndarray:
     bumps = np.exp(energy - energy.max(axis=2, keepdims=True))
     bumps /= bumps.sum(axis=2, keepdims=True)
     grid = np.array([*itertools.product(range(order), repeat=z.shape[1])])
-    return math.prod(bumps[:, i, grid[:, i]] for i in range(z.shape[1]))
+    return functools.reduce(np.multiply, (bumps[:, i, grid[:, i]] for i in range(z.shape[1])))
 
 
 FEATURES = {

@@ -31,7 +31,7 @@ def write(controller: Controller, folder: Path, command: Callable[[jax.Array], j
     exported = jax.export.export(jax.jit(command), platforms=PLATFORMS)(shape)
     exported = dataclasses.replace(exported, fun_name=f"{controller.name} {NO_SEAL}")
     program, text = (folder / f"{controller.name}.{ending}" for ending in ("stablehlo", "mlir"))
-    program.write_bytes(add_seal(exported.serialize()))
+    program.write_bytes(add_seal(bytes(exported.serialize())))
     text.write_bytes(add_seal(f"// {NO_SEAL}\n{exported.mlir_module()}".encode()))
     return [program, text]
 

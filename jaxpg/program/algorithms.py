@@ -7,12 +7,13 @@ An algorithm is a function here, `build(config, env) -> Algorithm` of one agent,
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable
+from collections.abc import Callable, Hashable
 from typing import Any
 
 import jax
 import optax
 
+from envs.base import Env
 from jaxpg import baselines, estimators, methods, shards
 from jaxpg.actor_critic import actor_critic
 from jaxpg.baselines import Baseline, of_returns, of_scores
@@ -47,40 +48,40 @@ BASELINES: dict[str, Baseline] = {
 RETURNS = {"to_go": estimators.reinforce, "whole": estimators.reinforce_whole}
 
 
-def make_algorithm(config: Config, env: Any) -> Algorithm:
+def make_algorithm(config: Config, env: Env) -> Algorithm:
     """One agent's algorithm, as pure functions."""
     algorithm = ALGORITHMS[config.choices["algo"]].make(config, env)
     return with_sigma(algorithm, log_sigma(config)) if config.network.sigma_is == "scheduled" else algorithm
 
 
-def make_td(config: Config, env: Any) -> Algorithm:
+def make_td(config: Config, env: Env) -> Algorithm:
     """The entry `td`."""
     return _make(actor_critic, config, env, td_method(config))
 
 
-def make_ppo(config: Config, env: Any) -> Algorithm:
+def make_ppo(config: Config, env: Env) -> Algorithm:
     """The entry `ppo`."""
     names = ("epochs", "minibatches", "clip", "value_clip", "max_kl")
     return _make(ppo, config, env, td_method(config), **{name: getattr(config.algo, name) for name in names})
 
 
-def make_reinforce(config: Config, env: Any) -> Algorithm:
+def make_reinforce(config: Config, env: Env) -> Algorithm:
     """The entry `reinforce`."""
     return _make(actor_critic, config, env, reinforce_method(config))
 
 
-def make_online(config: Config, env: Any) -> Algorithm:
+def make_online(config: Config, env: Env) -> Algorithm:
     """The entry `online`."""
     batch = vectorize(env, config.run.num_envs, training_length(config))
     return online_actor_critic(
-        batch, make_networks(config, env), num_steps=config.run.num_steps, **dataclasses.asdict(config.algo)
+        batch, make_networks(config, env), num_steps=config.run.rollout_steps, **dataclasses.asdict(config.algo)
     )
 
 
 def td_method(config: Config) -> Method:
     """The estimator of the options of TD and PPO."""
     algo = config.algo
-    return methods.td(algo.gamma, config.run.num_steps, ESTIMATORS[algo.estimator](algo))
+    return methods.td(algo.gamma, config.run.rollout_steps, ESTIMATORS[algo.estimator](algo))
 
 
 def reinforce_method(config: Config) -> Method:
@@ -89,7 +90,7 @@ def reinforce_method(config: Config) -> Method:
     return methods.reinforce(algo.gamma, BASELINES[algo.baseline], RETURNS[algo.returns], algo.discounted)
 
 
-def _make(make: Callable[..., Algorithm], config: Config, env: Any, method: Method, **options: Any) -> Algorithm:
+def _make(make: Callable[..., Algorithm], config: Config, env: Env, method: Method, **options: Any) -> Algorithm:
     """`actor_critic` or `ppo` with Adam, the environments in shards if the configuration asks for them.
 
     Args:
@@ -124,7 +125,10 @@ def make_optimizer(config: Config) -> optax.GradientTransformation:
         steps = optax.chain(optax.scale_by_adam(eps=1e-5), scale_by_progress(lambda progress: -1 * schedule(progress)))
         return optax.chain(optax.clip_by_global_norm(algo.max_gradient_norm), steps)
 
-    optimizers = {"actor": adam(algo.actor_lr), "critic": adam(algo.critic_lr)}
+    optimizers: dict[Hashable, optax.GradientTransformation] = {
+        "actor": adam(algo.actor_lr),
+        "critic": adam(algo.critic_lr),
+    }
     if config.network.sigma_is != "scheduled":
         return optax.multi_transform(optimizers, {"actor": "actor", "critic": "critic"})
-    return optax.multi_transform(optimizers | {"sigma": left_alone()}, labels)
+    return optax.multi_transform({**optimizers, "sigma": left_alone()}, labels)

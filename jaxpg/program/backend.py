@@ -6,15 +6,18 @@ import contextlib
 import os
 import subprocess
 import sys
+from typing import Any
 
 import jax
-import jaxlib
+import jaxlib.version
 
 from jaxpg.compatibility import may_deadlock
 from jaxpg.config.configuration import LIBRARIES, Config
 from jaxpg.errors import UserError
 
 # Of LLVM. With 3, XLA's default, a training compiles a quarter longer and runs no faster.
+OPTIMIZED: dict[str, Any]
+RUN_ONCE: dict[str, Any]
 OPTIMIZED, RUN_ONCE = ({"xla_backend_optimization_level": level} for level in (2, 0))
 
 
@@ -29,7 +32,7 @@ def prepare(config: Config, threads: int | None = None) -> None:
       UserError: the process's environment asks JAX for something that cannot be trained with.
     """
     _check_variables()
-    if threads is None and config.choices["env"] in LIBRARIES and may_deadlock(jaxlib.__version__):
+    if threads is None and config.choices["env"] in LIBRARIES and may_deadlock(jaxlib.version.__version__):
         threads = 1
     os.environ["PJRT_NPROC"] = str(threads or num_threads())
     with contextlib.suppress(RuntimeError):  # where the process has computed something already, with what it has
@@ -38,7 +41,7 @@ def prepare(config: Config, threads: int | None = None) -> None:
         jax.devices()
     except (RuntimeError, AssertionError) as error:  # the latter, without words, where jax has no plugin for it
         reason = (str(error).splitlines() or ["there is no such platform here; cpu is one"])[0]
-        raise UserError(f"JAX_PLATFORMS={jax.config.jax_platforms}: {reason}") from error
+        raise UserError(f"JAX_PLATFORMS={jax.config.values['jax_platforms']}: {reason}") from error
 
 
 def num_threads() -> int:
@@ -47,13 +50,13 @@ def num_threads() -> int:
     if asked:
         return int(asked)
     # The cores that this process may use; where nobody knows, as on a Mac, all.
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def _check_variables() -> None:
-    if jax.config.jax_enable_x64:
+    if jax.config.values["jax_enable_x64"]:
         raise UserError("JAX_ENABLE_X64: training is in float32; unset it")
-    if jax.config.jax_disable_jit:
+    if jax.config.values["jax_disable_jit"]:
         raise UserError("JAX_DISABLE_JIT: training is one compiled program; unset it")
     threads = os.environ.get("PJRT_NPROC")
     if threads and not (threads.isascii() and threads.isdigit() and int(threads)):

@@ -7,11 +7,12 @@ import functools
 import math
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import numpy as np
 
+from envs.base import Env
 from jaxpg import shards
 from jaxpg.config.configuration import Config
 from jaxpg.evaluation import Episodes, evaluate
@@ -19,12 +20,13 @@ from jaxpg.nonfinite import skip_nonfinite, stop_at_nonfinite
 from jaxpg.policy import deterministic_policy
 from jaxpg.program.agents import Agents, agents_of, with_values
 from jaxpg.program.algorithms import make_algorithm
+from jaxpg.program.allocator import trimming
 from jaxpg.program.backend import OPTIMIZED, RUN_ONCE
 from jaxpg.program.mapping import groups_at_once, in_groups, over_agents
 from jaxpg.program.networks import make_networks
 from jaxpg.program.state import Policy, RunState, current_policy, initial_run
 from jaxpg.training import train_chunk
-from jaxpg.types import Metrics, TrainState
+from jaxpg.types import TrainState
 
 # Evaluations during training play the same starts in every run; `jaxpg.evaluate` draws others.
 SELECTION_SEED = 2**31
@@ -41,7 +43,7 @@ class Program(NamedTuple):
     """
 
     init: Callable[[], RunState] | None
-    advance: Callable[..., tuple[TrainState, Metrics]]
+    advance: Callable[..., tuple[TrainState, dict[str, np.ndarray]]]
     evaluate: Callable[[Policy], Episodes]
     state_shape: RunState
 
@@ -51,7 +53,7 @@ NAN_POLICIES = {"stop": stop_at_nonfinite, "skip": skip_nonfinite}
 
 def compile_program(
     config: Config,
-    env: Any,
+    env: Env,
     chunk: int,
     agents: Agents | None = None,
     resumed: bool = False,
@@ -74,31 +76,32 @@ def compile_program(
     size, agents = config.run.vmap_seeds, agents or agents_of(config)
     init, advance, play = (over_agents(fn, size) for fn in _of_one_agent(config, env, chunk))
     of_group = jax.tree.map(lambda x: x[:size], agents)
-    init = jax.jit(init).trace(of_group)
-    shape = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype), init.out_info)
-    with _compilers() as pool:
+    traced = jax.jit(init).trace(of_group)
+    shape = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype), traced.out_info)
+    with trimming(), _compilers() as pool:
         # Tracing holds Python's lock and compiling does not: one trace after the other, that of the longest compilation
         # first, so that no compilation waits for another one's trace.
-        advance = pool.submit(jax.jit(advance).lower(of_group, shape.train, number=chunk).compile, OPTIMIZED)
-        init = None if resumed else pool.submit(init.lower().compile, RUN_ONCE)
-        play = pool.submit(jax.jit(play).lower(current_policy(shape.train)).compile, OPTIMIZED)
+        advancing = pool.submit(jax.jit(advance).lower(of_group, shape.train, number=chunk).compile, OPTIMIZED)
+        starting = None if resumed else pool.submit(traced.lower().compile, RUN_ONCE)
+        playing = pool.submit(jax.jit(play).lower(current_policy(shape.train)).compile, OPTIMIZED)
         meanwhile()
-    at_once = groups_at_once(config)
-    init, advance, play = (in_groups(fn.result(), size, at_once) if fn else None for fn in (init, advance, play))
+        start_group, advance_group, play_group = starting and starting.result(), advancing.result(), playing.result()
+    of_all = functools.partial(in_groups, size=size, at_once=groups_at_once(config))
+    advance_all = of_all(advance_group)
 
     def advance_by(train, number=chunk):
-        train, metrics = advance(agents, train, number=number)
+        train, metrics = advance_all(agents, train, number=number)
         return train, {name: np.asarray(x)[:, :number] for name, x in metrics.items()}
 
     return Program(
-        functools.partial(init, agents) if init else None,
+        functools.partial(of_all(start_group), agents) if start_group else None,
         advance_by,
-        play,
+        of_all(play_group),
         jax.tree.map(lambda x: jax.ShapeDtypeStruct((len(agents.seed), *x.shape[1:]), x.dtype), shape),
     )
 
 
-def _of_one_agent(config: Config, env: Any, chunk: int) -> tuple[Callable, Callable, Callable]:
+def _of_one_agent(config: Config, env: Env, chunk: int) -> tuple[Callable, Callable, Callable]:
     """`init(agent)`, `advance(agent, train, number)` and `play(policy)`, to be traced."""
     run, networks = config.run, make_networks(config, env)
 

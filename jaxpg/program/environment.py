@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 import envs
+from envs.base import Env
 from envs.options import OptionError
 from jaxpg.config.configuration import Config
 from jaxpg.program.networks import NUM_FEATURES
@@ -12,7 +13,7 @@ from jaxpg.program.networks import NUM_FEATURES
 MAX_FEATURES = 10_000  # a grid over many observations is soon beyond any memory
 
 
-def make_env(config: Config) -> Any:
+def make_env(config: Config) -> Env:
     """The environment; raises OptionError where it has a mistake to report, or where the features do not fit it."""
     env = envs.make_from_config(config.choices["env"], config.env)
     _check_features(config.network, env.observation_size)

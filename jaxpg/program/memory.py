@@ -13,6 +13,7 @@ from typing import Any
 
 import jax
 
+from envs.base import Env
 from jaxpg.config.configuration import Config, flatten
 from jaxpg.errors import UserError
 from jaxpg.networks import Networks
@@ -33,13 +34,13 @@ CGROUPS = (
 )
 
 
-def check(config: Config, env: Any) -> None:
+def check(config: Config, env: Env) -> None:
     """Raises UserError where the run needs more memory than is available; it names the option that takes the most."""
     need, have = needed(config, env), available()
     if have is None or need <= have:
         return
     least = {name: needed(smallest, env) for name, smallest in _smallest(config).items()}
-    name = min(least, key=least.get)
+    name = min(least, key=least.__getitem__)
     value, advice = flatten(config)[name], ""
     if name == "num_envs" and have > least[name]:
         share = (have - least[name]) / (need - least[name])  # what is needed is linear in num_envs
@@ -62,7 +63,7 @@ def _smallest(config: Config) -> dict[str, Config]:
     return found
 
 
-def needed(config: Config, env: Any) -> int:
+def needed(config: Config, env: Env) -> int:
     """Bytes of what a run holds at once: the agents' states, the rollouts that are learned from, a chunk's metrics.
 
     It is an estimate from below: XLA may keep more.

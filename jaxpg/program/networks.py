@@ -10,6 +10,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
+from envs.base import Env
 from jaxpg import features, networks
 from jaxpg.config.configuration import Config
 from jaxpg.config.entries import NETWORKS
@@ -38,7 +39,7 @@ SIGMAS: dict[str, Callable[[float], Sigma]] = {
 }
 
 
-def make_networks(config: Config, env: Any) -> Networks:
+def make_networks(config: Config, env: Env) -> Networks:
     """Actor and critic for the environment's sizes."""
     return NETWORKS[config.choices["network"]].make(config.network, env.observation_size, env.action_size)
 

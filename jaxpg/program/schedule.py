@@ -39,7 +39,7 @@ class Schedule(NamedTuple):
 def plan(config: Config) -> Schedule:
     """The updates of a run: its steps rounded up to whole updates, and intervals to whole updates and chunks."""
     run = config.run
-    steps_per_update = run.num_envs * run.num_steps
+    steps_per_update = run.num_envs * run.rollout_steps
     num_updates = _ceil(run.total_steps, steps_per_update)
     chunk = min(_ceil(run.log_interval, steps_per_update), num_updates)
     return Schedule(

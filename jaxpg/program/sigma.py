@@ -20,8 +20,8 @@ def left_alone() -> optax.GradientTransformation:
     def init(params):
         return jnp.zeros((), jnp.int32)
 
-    def update(gradients, count, params=None):
-        return jax.tree.map(jnp.zeros_like, gradients), count + 1
+    def update(updates, state, params=None):
+        return jax.tree.map(jnp.zeros_like, updates), state + 1
 
     return optax.GradientTransformation(init, update)
 

@@ -51,12 +51,13 @@ def start(train: TrainState) -> RunState:
 
 
 def current_policy(train: TrainState) -> Policy:
+    """The policy as it is after the updates made so far."""
     return Policy(train.params, train.normalizer)
 
 
 def is_key(leaf: Any) -> bool:
     """Whether an array holds random keys, which numpy does not know."""
-    return jax.dtypes.issubdtype(leaf.dtype, jax.dtypes.prng_key)
+    return jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key)
 
 
 def better(old: Best, new: Best) -> Best:
@@ -66,8 +67,8 @@ def better(old: Best, new: Best) -> Best:
     """
     improved = np.asarray(new.episode_return) > np.asarray(old.episode_return)
 
-    def choose(a: jax.Array, b: jax.Array) -> np.ndarray:
-        a, b = np.asarray(a), np.asarray(b)
+    def choose(old_leaf: jax.Array, new_leaf: jax.Array) -> np.ndarray:
+        a, b = np.asarray(old_leaf), np.asarray(new_leaf)
         return np.where(improved.reshape(improved.shape + (1,) * (a.ndim - 1)), a, b)
 
     return jax.tree.map(choose, new, old)

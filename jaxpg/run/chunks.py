@@ -89,7 +89,7 @@ class NonFiniteMonitor:
     def observe(self, before: TrainState, metrics: Metrics) -> None:
         """Looks at a chunk: the state `before` it and its metrics, `[S, chunk]`."""
         unsound, first_update = np.asarray(metrics["nonfinite"]), np.asarray(before.update) + 1
-        for agent in np.flatnonzero(unsound.any(axis=-1)):
+        for agent in np.flatnonzero(unsound.any(axis=-1)).tolist():
             if agent not in self._reported_agents:
                 self._reported_agents.add(agent)
                 self._report(agent, first_update[agent], metrics)

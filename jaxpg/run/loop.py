@@ -127,7 +127,7 @@ def _evaluate(program: Program, state: RunState) -> tuple[RunState, dict[str, An
     return state._replace(best=best), {f"eval_{name}": to_json(value) for name, value in results.items()}
 
 
-def is_solved(run: Run, best_returns: np.ndarray) -> bool:
+def is_solved(run: Run, best_returns: jax.Array | np.ndarray) -> bool:
     """Whether the run has reached `stop_return`: with all agents, or with one of them."""
     if run.stop_return is None:
         return False

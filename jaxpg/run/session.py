@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from envs.base import interface
+from envs.base import Env, interface
 from jaxpg.config import configuration
 from jaxpg.config.configuration import Config
 from jaxpg.divergence import BOUND
@@ -75,7 +75,7 @@ def begin(config: Config, finish: Finish, check: Callable[[RunFolder], None] = f
         return _begin(config, finish, env, run_folder)
 
 
-def _begin(config: Config, finish: Finish, env: Any, run_folder: RunFolder) -> int:
+def _begin(config: Config, finish: Finish, env: Env, run_folder: RunFolder) -> int:
     schedule, run = plan(config), config.run
     versions_file.write(run_folder.versions)
     run_files.replace(run_folder.config, configuration.to_yaml(config))
@@ -86,12 +86,13 @@ def _begin(config: Config, finish: Finish, env: Any, run_folder: RunFolder) -> i
     )
     session = Session(config, schedule, run_folder, display)
     program, seconds = _compile(session, env)
+    assert program.init is not None  # only where a run is resumed
     state = program.init()
     _check_start(np.asarray(state.train.env_state.obs), env)
     return _train(session, finish, program, state, seconds)
 
 
-def _check_start(obs: np.ndarray, env: Any) -> None:
+def _check_start(obs: np.ndarray, env: Env) -> None:
     """Raises UserError if an initial observation, `[S, N, n]`, is in the range that counts as diverged."""
     outside = ~(np.abs(obs) <= BOUND)
     if outside.any():
@@ -191,7 +192,7 @@ def _announce_resume(session: Session, update: int, jump: str | None, changes: M
         say(f"note: {versions.describe_change(*change)}")
 
 
-def _make_env(config: Config) -> Any:
+def _make_env(config: Config) -> Env:
     """The environment, after checking that the run fits into memory."""
     with physics_cache(config.run.cache):
         env = make_env(config)
@@ -199,7 +200,7 @@ def _make_env(config: Config) -> Any:
     return env
 
 
-def _compile(session: Session, env: Any, resumed: bool = False) -> tuple[Program, float]:
+def _compile(session: Session, env: Env, resumed: bool = False) -> tuple[Program, float]:
     """The compiled program, and the seconds of compilation."""
     config, display, began = session.config, session.display, time.monotonic()
     what = f"{config.choices['algo']} on {config.task}, network={config.choices['network']}"

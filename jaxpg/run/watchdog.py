@@ -11,7 +11,7 @@ from collections import deque
 from collections.abc import Iterator
 from contextlib import contextmanager
 
-import jaxlib
+import jaxlib.version
 
 from jaxpg.compatibility import may_deadlock
 
@@ -67,9 +67,10 @@ class Watchdog:
 
 def describe_cause() -> str:
     """Why a computation may not end, and what to do about it."""
-    if may_deadlock(jaxlib.__version__):
+    version = jaxlib.version.__version__
+    if may_deadlock(version):
         return (
-            f"jaxlib {jaxlib.__version__} can hang in batched LAPACK calls, which brax's and your own environments may "
+            f"jaxlib {version} can hang in batched LAPACK calls, which brax's and your own environments may "
             "make; PJRT_NPROC=1 or jaxlib 0.12 avoids it. Where each thread is:"
         )
     return "the machine may be out of memory, or busy with other work. Where each thread is:"

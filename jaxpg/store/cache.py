@@ -57,7 +57,7 @@ def compilation_cache(enabled: bool, say: Callable[[str], None]) -> Iterator[Non
       say: takes the line, if there is something to say.
     """
     with _ALONE:
-        staged = _stage(say) if enabled and jax.config.jax_compilation_cache_dir is None else None
+        staged = _stage(say) if enabled and jax.config.values["jax_compilation_cache_dir"] is None else None
         if staged is None:
             with filter_stderr():
                 yield

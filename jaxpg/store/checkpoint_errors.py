@@ -25,15 +25,17 @@ class SaveError(Exception):
 
 
 def reason(error: BaseException) -> str:
-    """The operating system's words, if it has refused something, and else the first line of the message.
+    r"""The operating system's words, if it has refused something, and else the first line of the message.
 
-    >>> reason(ValueError("first\\nsecond"))
+    >>> reason(ValueError("first\nsecond"))
     'first'
     """
     cause: BaseException | None = error
     while cause is not None:
         code = re.search(r"os_error_code='(\d+)'", str(cause))  # tensorstore's, in a ValueError
-        if code or (isinstance(cause, OSError) and cause.errno):
-            return os.strerror(int(code[1])) if code else cause.strerror
+        if code:
+            return os.strerror(int(code[1]))
+        if isinstance(cause, OSError) and cause.errno:
+            return cause.strerror or os.strerror(cause.errno)
         cause = cause.__cause__ or cause.__context__
     return (str(error).splitlines() or [type(error).__name__])[0]

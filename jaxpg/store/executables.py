@@ -12,7 +12,7 @@ import platform
 import tempfile
 from pathlib import Path
 
-import jaxlib
+import jaxlib.version
 
 from jaxpg.program.backend import num_threads
 from jaxpg.store.cache_folder import STAGING, CacheError, digest, make_private, remove_old
@@ -87,8 +87,8 @@ class Executables:
 
 def machine() -> str:
     """The name of the folder for what was compiled here."""
-    flags = os.environ.get("XLA_FLAGS", "").encode()
-    return f"jaxlib-{jaxlib.__version__}-cpu-{digest(cpu_features())}-flags-{digest(flags)}-threads-{num_threads()}"
+    version, flags = jaxlib.version.__version__, os.environ.get("XLA_FLAGS", "").encode()
+    return f"jaxlib-{version}-cpu-{digest(cpu_features())}-flags-{digest(flags)}-threads-{num_threads()}"
 
 
 def cpu_features() -> bytes:

@@ -13,7 +13,7 @@ import secrets
 import stat
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import BinaryIO
+from typing import IO
 
 UNFINISHED = ".unfinished"  # ending of a file that is renamed once it is complete
 FOLDER = os.O_RDONLY | getattr(os, "O_DIRECTORY", 0)  # missing on Windows, where nothing is trained
@@ -55,7 +55,7 @@ def read(path: Path) -> bytes:
 
 
 @contextlib.contextmanager
-def open_file(path: Path, flags: int) -> Iterator[BinaryIO]:
+def open_file(path: Path, flags: int) -> Iterator[IO[bytes]]:
     """Opens a file in the block, with flags as for `os.open`; raises OSError as `read` does."""
     mode = {os.O_RDONLY: "rb", os.O_WRONLY: "wb", os.O_RDWR: "r+b"}[flags & os.O_ACCMODE]
     with open_folder(path.parent) as folder, os.fdopen(open_at(folder, path.name, flags), mode) as file:

@@ -16,7 +16,6 @@ lock                the process that is training in it
 from __future__ import annotations
 
 import contextlib
-import itertools
 import os
 import re
 import stat
@@ -79,11 +78,13 @@ def _make_new(path: Path) -> Path:
     """Creates a folder of that name, with a number appended if runs start in the same second."""
     with _report_errors(path):
         path.parent.mkdir(parents=True, exist_ok=True)
-        for number in itertools.count(1):
-            folder = path if number == 1 else path.with_name(f"{path.name}-{number}")
-            with contextlib.suppress(FileExistsError):
-                folder.mkdir()
-                return folder
+    folder, number = path, 1
+    while True:
+        with _report_errors(path), contextlib.suppress(FileExistsError):
+            folder.mkdir()
+            return folder
+        number += 1
+        folder = path.with_name(f"{path.name}-{number}")
 
 
 def _check_name(path: Path) -> None:

@@ -76,6 +76,12 @@ class OrbaxFolder:
     def _make_manager(self) -> ocp.CheckpointManager:
         return ocp.CheckpointManager(self._place, item_names=("state", "meta"), options=self._options)
 
+    @property
+    def _opened(self) -> ocp.CheckpointManager:
+        """Orbax's manager; there is none where whoever only looks has found no folder."""
+        assert self._manager is not None
+        return self._manager
+
     def numbers(self) -> list[int]:
         """The numbers of all saves, the newest first."""
         return sorted(self._manager.all_steps(), reverse=True) if self._manager else []
@@ -97,7 +103,7 @@ class OrbaxFolder:
         """
         arguments = ocp.args.Composite(state=ocp.args.StandardSave(arrays), meta=ocp.args.JsonSave(record))
         with self._writing(step):
-            saved = self._manager.save(step, args=arguments)
+            saved = self._opened.save(step, args=arguments)
             if saved:
                 _synchronize(self._place / str(step))
             if saved and not self._proven:
@@ -114,7 +120,7 @@ class OrbaxFolder:
         """
         with self._writing(step):
             for later in [number for number in self.numbers() if number >= step]:
-                self._manager.delete(later)
+                self._opened.delete(later)
             place = self._place / str(step)
             if os.path.lexists(place) and (place.is_symlink() or not place.is_dir()):  # which orbax does not see
                 place.unlink()
@@ -169,7 +175,7 @@ class OrbaxFolder:
         _silence_what_is_left_behind()
         try:
             _check_own(self._place / str(step))
-            return self._manager.restore(step, args=ocp.args.Composite(**items))
+            return self._opened.restore(step, args=ocp.args.Composite(**items))
         except Exception as error:
             why = reason(error).replace(str(self._place), str(self.folder))
             raise CheckpointError(f"{self.folder / str(step)}: cannot be read ({why})") from error

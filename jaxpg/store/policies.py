@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
-from envs.base import Interface, interface
+from envs.base import Env, Interface, interface
 from jaxpg import normalization
 from jaxpg.config import configuration
 from jaxpg.config.configuration import Config
@@ -42,7 +42,7 @@ class StoredPolicy(NamedTuple):
     act: Callable[[Policy, Any], Any]
     value: Callable[[Policy, Any], Any]
     policy: Policy
-    env: Any
+    env: Env
     interface: Interface
     config: Config
     agent: str
@@ -111,24 +111,25 @@ def load_several(
     ]
 
 
-def make_stored_policy(config: Config, env: Any, policy: Policy, update: int, agent: str) -> StoredPolicy:
+def make_stored_policy(config: Config, env: Env, policy: Policy, update: int, agent: str) -> StoredPolicy:
     """The policy with `act` and `value` as its configuration defines them; for the arguments see `StoredPolicy`."""
     networks, reward_scale = make_networks(config, env), config.algo.reward_scale
 
-    def act(policy, obs):
+    def act(policy: Policy, obs):
         return deterministic_policy(networks, *policy)(obs)
 
-    def value(policy, obs):
+    def value(policy: Policy, obs):
         return value_function(networks, *policy, reward_scale)(obs)
 
     return StoredPolicy(act, value, policy, env, rename_interface(interface(env)), config, agent, update)
 
 
-def _make_template(config: Config, env: Any) -> Best:
+def _make_template(config: Config, env: Env) -> Best:
     """Shapes and types in the folder `best`, found without optimizer and environments."""
     params = jax.eval_shape(make_networks(config, env).init, jax.random.key(0))
-    one = Best(Policy(params, normalization.init(env.observation_size)), np.float32(0))
-    return jax.tree.map(lambda x: jax.ShapeDtypeStruct((config.num_agents, *x.shape), x.dtype), one)
+    policy = Policy(params, normalization.init(env.observation_size))
+    one = policy, np.float32(0)
+    return Best(*jax.tree.map(lambda x: jax.ShapeDtypeStruct((config.num_agents, *x.shape), x.dtype), one))
 
 
 def _restore(checkpoints: Checkpoints, template: Any, config: Config, part: str = "") -> tuple[Any, int]:

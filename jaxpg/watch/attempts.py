@@ -1,7 +1,7 @@
 """Drawing must not fail a trained run: what cannot be drawn is skipped, with a note that says why.
 
-Drawing errors are caught only here. If an environment cannot be drawn, `NotDrawn` gives a note. Any other exception is
-a bug: the user gets a note that names it, and with JAXPG_RAISE=1 in the environment, as in the tests, it is raised.
+Drawing errors are caught only here. If an environment cannot be drawn, `DrawingError` gives a note. Any other exception
+is a bug: the user gets a note that names it, and with JAXPG_RAISE=1 in the environment, as in the tests, it is raised.
 """
 
 from __future__ import annotations
@@ -15,10 +15,10 @@ from typing import TypeVar
 from jaxpg.errors import UserError
 
 RAISE = "JAXPG_RAISE"
-Result = TypeVar("Drawn")
+Result = TypeVar("Result")
 
 
-class NotDrawn(Exception):
+class DrawingError(Exception):
     """Something of an environment cannot be drawn; the text says what and why."""
 
 
@@ -32,7 +32,7 @@ def attempt(what: str, draw: Callable[[], Result], say: Callable[[str], None]) -
     """
     try:
         return draw()
-    except (NotDrawn, UserError) as error:
+    except (DrawingError, UserError) as error:
         say(f"no {what}: {error}")
     except Exception as error:
         if os.environ.get(RAISE):

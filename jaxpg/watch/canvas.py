@@ -15,6 +15,7 @@ from jaxpg.watch import gl
 from jaxpg.watch.drawing import find_geoms
 
 GOAL = (0.1, 0.6, 0.25, 0.5)
+DOT = 0.02  # radius of a goal that has none, as a fraction of the model's size
 POSITIVE = (0.95, 0.55, 0.05, 1.0)  # efforts: right-handed about the axis, or along it
 NEGATIVE = (0.55, 0.25, 0.75, 1.0)
 FULL_SWEEP = 1.5 * math.pi  # of an arc at effort 1 [rad]
@@ -99,7 +100,8 @@ class Canvas:
         everything = mujoco.mjtCatBit.mjCAT_ALL.value
         mujoco.mjv_updateScene(model, data, self._options, None, _make_camera(model), everything, scene)
         if cell.goal is not None:
-            _add_geom(scene, mujoco.mjtGeom.mjGEOM_SPHERE, cell.goal, self._goal_radius, GOAL)
+            radius = self._goal_radius or DOT * model.stat.extent
+            _add_geom(scene, mujoco.mjtGeom.mjGEOM_SPHERE, cell.goal, radius, GOAL)
         for motor in self._motors:
             _draw_effort(scene, model, data, motor, float(np.clip(cell.efforts[motor], -1, 1)))
         mujoco.mjr_render(place, scene, self._context)

@@ -8,6 +8,7 @@ from typing import NamedTuple
 import jax
 import numpy as np
 
+from envs.scenes import find_time_step
 from jaxpg.store.names import STEP_SERIES
 from jaxpg.store.policies import StoredPolicy
 from jaxpg.watch.recording import Look, Recording
@@ -56,7 +57,7 @@ def make_clip(stored: StoredPolicy, recording: Recording, episode: int, most: in
         look=jax.tree.map(lambda x: x[steps, episode], recording.look),
         series={name: x[steps[:-1], episode] for name, x in (commands | step_series).items()},
         so_far=np.append(0.0, np.cumsum(recording.reward[:length, episode], dtype=np.float64))[steps],
-        dt=interval * float(stored.env.dt),
+        dt=interval * find_time_step(stored.env),
         episode_return=float(recording.episode_return[episode]),
         success=success_at_end > 0 if np.isfinite(success_at_end) else None,
     )

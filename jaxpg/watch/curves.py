@@ -35,11 +35,11 @@ def make_curves(config: Config, lines: Sequence[Json], references: Mapping[str, 
     """
     panels = []
     for name, title in PANELS.items():
-        entries = [(label, name, agents) for label, agents in _select_agents(config, lines, POLICY).items()]
+        entries = [(label, (name, agents)) for label, agents in _select_agents(config, lines, POLICY).items()]
         if not config.sweep and name == "eval_return":
-            entries.append((TRAINING, "return", slice(None)))
+            entries.append((TRAINING, ("return", slice(None))))
         panels.append(
-            _make_panel(title, [make_curve(label, *figures.select_series(lines, *which)) for label, *which in entries])
+            _make_panel(title, [make_curve(label, *figures.select_series(lines, *which)) for label, which in entries])
         )
     panels[0]["references"] = [{"label": label, "value": value} for label, value in references.items()]
     return [panel for panel in panels if panel["series"]]
@@ -74,15 +74,14 @@ def _make_panel(title: str, series: Sequence[Json]) -> Json:
 
 def make_curve(label: str, steps: np.ndarray, values: np.ndarray) -> Json:
     """One curve; for several agents, `[S, K]`, their interquartile mean and its `seed_interval`."""
-    has_interval = len(values) > 1 and len(steps)
-    low, high = seed_interval(values) if has_interval else (None, None)
+    interval = seed_interval(values) if len(values) > 1 and len(steps) else None
     return {
         "label": label,
         "steps": steps.tolist(),
         "mean": round_numbers(interquartile_mean(values)),
-        "low": round_numbers(low) if has_interval else None,
-        "high": round_numbers(high) if has_interval else None,
-        "band": f"{len(values)} seeds, {seed_interval_name(len(values))}" if has_interval else None,
+        "low": round_numbers(interval[0]) if interval else None,
+        "high": round_numbers(interval[1]) if interval else None,
+        "band": f"{len(values)} seeds, {seed_interval_name(len(values))}" if interval else None,
     }
 
 

@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 import mujoco
 import numpy as np
 
-from jaxpg.watch.attempts import NotDrawn
+from jaxpg.watch.attempts import DrawingError
 
 SIDE = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])  # for models without a camera
 TRAVEL = 4.0  # a robot that travels this many times its own size is kept in the middle
@@ -95,7 +95,7 @@ def make_picture(model: Any) -> Picture:
     the bodies.
 
     Raises:
-      NotDrawn: there are no bodies either.
+      DrawingError: there are no bodies either.
     """
     axes, data = camera_axes(model), mujoco.MjData(model)
     mujoco.mj_kinematics(model, data)
@@ -105,7 +105,7 @@ def make_picture(model: Any) -> Picture:
         model
     )
     if not parts:
-        raise NotDrawn("the model has no geoms and no bodies")
+        raise DrawingError("the model has no geoms and no bodies")
     depth = (data.geom_xpos if geoms else data.xipos) @ axes[2]
     parts.sort(key=lambda part: round(float(depth[part.number]), 6))
     return Picture(model, axes, parts, not geoms, _find_motors(model, axes))
@@ -114,7 +114,7 @@ def make_picture(model: Any) -> Picture:
 def find_geoms(model: Any) -> list[int]:
     """The visible geoms, or all if none is visible; without planes and height fields."""
     unbounded = (mujoco.mjtGeom.mjGEOM_PLANE, mujoco.mjtGeom.mjGEOM_HFIELD)
-    geoms = [int(i) for i in np.flatnonzero(~np.isin(model.geom_type, unbounded)) if _find_rgba(model, i)[3]]
+    geoms = [i for i in np.flatnonzero(~np.isin(model.geom_type, unbounded)).tolist() if _find_rgba(model, i)[3]]
     return [i for i in geoms if model.geom_group[i] < 3] or geoms
 
 

@@ -57,7 +57,9 @@ def play_gymnasium(stored: StoredPolicy, num_episodes: int, seed: int) -> Result
     except ImportError:
         raise UserError(f"backend=gymnasium needs Gymnasium: {pip_install('gymnasium')}") from None
     pendulums = gymnasium.make_vec("Pendulum-v1", num_envs=num_episodes, vectorization_mode="sync")
-    limit = pendulums.single_action_space.high
+    actions = pendulums.single_action_space
+    assert isinstance(actions, gymnasium.spaces.Box)
+    limit = actions.high
     act = jax.jit(stored.act)
     obs, _ = pendulums.reset(seed=seed)
     returns = np.zeros(num_episodes)

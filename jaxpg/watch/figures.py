@@ -45,8 +45,8 @@ def draw_sweep_curves(
             _draw(axes, *select_series(lines, name, agents), label)
     number = max(agents.stop - agents.start for agents in settings.values())
     handles, labels = panels["eval_return"].get_legend_handles_labels()
-    title = f"interquartile mean of {number} seeds,\n{seed_interval_name(number)}" if number > 1 else None
-    legend = figure.legend(handles, labels, loc="outside right center", title=title, fontsize=8, title_fontsize=8)
+    caption = f"interquartile mean of {number} seeds,\n{seed_interval_name(number)}" if number > 1 else None
+    legend = figure.legend(handles, labels, loc="outside right center", title=caption, fontsize=8, title_fontsize=8)
     # The legend goes next to the panels, which keep their size.
     figure.set_figwidth(figure.get_figwidth() + legend.get_window_extent().width / figure.dpi)
     figure.savefig(file, dpi=120)

@@ -11,7 +11,7 @@ import numpy as np
 from envs.scenes import PhasePlane, Scene
 from jaxpg.store.policies import StoredPolicy
 from jaxpg.watch import drawing
-from jaxpg.watch.attempts import NotDrawn, attempt
+from jaxpg.watch.attempts import DrawingError, attempt
 from jaxpg.watch.clips import Clip, find_command_names, find_limits, make_clip
 from jaxpg.watch.curves import round_numbers
 from jaxpg.watch.recording import Recording, compute_value_map
@@ -38,23 +38,29 @@ def build_player(
     """
     scene, plane = view
     metrics = recordings[0].metrics
-    has_workspace = scene and scene.goal and "success" in metrics
-    return {
-        "player": attempt("episodes", lambda: _make_player(view, stages, recordings, say), say) if scene else None,
-        "portrait": attempt("phase portrait", lambda: _make_portrait(plane, stages), say) if plane else None,
-        "workspace": attempt("workspace", lambda: _make_workspace(scene, recordings), say) if has_workspace else None,
-    }
+    made: Json = {"player": None, "portrait": None, "workspace": None}
+    if scene:
+        made["player"] = attempt("episodes", lambda: _make_player(scene, plane, stages, recordings, say), say)
+    if plane:
+        made["portrait"] = attempt("phase portrait", lambda: _make_portrait(plane, stages), say)
+    if scene and scene.goal and "success" in metrics:
+        made["workspace"] = attempt("workspace", lambda: _make_workspace(scene, recordings), say)
+    return made
 
 
 def _make_player(
-    view: View, stages: Mapping[str, StoredPolicy], recordings: Sequence[Recording], say: Callable[[str], None]
+    scene: Scene,
+    plane: PhasePlane | None,
+    stages: Mapping[str, StoredPolicy],
+    recordings: Sequence[Recording],
+    say: Callable[[str], None],
 ) -> Json:
     stored = next(iter(stages.values()))
     stage_clips = [
         [make_clip(stage, recording, i, MAX_FRAMES) for i in range(min(MAX_EPISODES, len(recording.length)))]
         for stage, recording in zip(stages.values(), recordings, strict=True)
     ]
-    picture = drawing.make_picture(view.scene.model)
+    picture = drawing.make_picture(scene.model)
     stage_frames = [[drawing.draw(picture, one.look.qpos, one.look.goal) for one in clips] for clips in stage_clips]
     motors = attempt("motors", lambda: _list_motors(stored, picture), say) or []
     return {
@@ -65,15 +71,14 @@ def _make_player(
         ],
         "motors": motors,
         "limits": _list_limits(stored),
-        "goal_radius": view.scene.goal_radius and float(view.scene.goal_radius),
+        "goal_radius": scene.goal_radius and float(scene.goal_radius),
         "series": list(stage_clips[0][0].series),
         "policies": [
             {
                 "label": label,
                 "note": f"{stage.update:,} updates",
                 "episodes": [
-                    _make_episode(one, frames, view.plane, bool(motors))
-                    for one, frames in zip(clips, several, strict=True)
+                    _make_episode(one, frames, plane, bool(motors)) for one, frames in zip(clips, several, strict=True)
                 ],
             }
             for (label, stage), clips, several in zip(stages.items(), stage_clips, stage_frames, strict=True)
@@ -86,7 +91,7 @@ def _list_motors(stored: StoredPolicy, picture: drawing.Picture) -> list[Json]:
     names, number = find_command_names(stored), picture.model.nu
     if len(names) != number:
         commands = "command" if len(names) == 1 else "commands"
-        raise NotDrawn(f"the policy has {len(names)} {commands}, the model {number} actuators: cannot match them")
+        raise DrawingError(f"the policy has {len(names)} {commands}, the model {number} actuators: cannot match them")
     limits = _list_limits(stored)
     return [
         {"name": names[motor.command], "limit": limits.get(names[motor.command]), "sign": motor.sign}
@@ -123,7 +128,7 @@ def _make_portrait(plane: PhasePlane, stages: Mapping[str, StoredPolicy]) -> Jso
     stored = next(iter(stages.values()))
     maps = compute_value_map(stored, [stage.policy for stage in stages.values()], GRID, GRID)
     if not np.isfinite(maps).all():
-        raise NotDrawn("the critic's values are not finite everywhere")
+        raise DrawingError("the critic's values are not finite everywhere")
     axes = [
         {"label": label, "range": list(ends), "wraps": wraps}
         for label, ends, wraps in zip(plane.labels, plane.ranges, plane.wraps, strict=True)

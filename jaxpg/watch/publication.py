@@ -5,7 +5,7 @@ from __future__ import annotations
 import csv
 import io
 from collections.abc import Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -14,12 +14,15 @@ from jaxpg.watch.curves import PANELS
 from jaxpg.watch.figures import COLORS
 from jaxpg.watch.methods import Method, compute_standings
 
+if TYPE_CHECKING:
+    from matplotlib.typing import RcKeyType
+
 WIDTH, HEIGHT = 3.4, 2.6  # of a panel [inch]: one column of a paper
 # Methods also differ in dashes and marks, so that the figure can be read without colours.
 DASHES = ("-", "--", "-.", ":")
 MARKS = ("o", "s", "^", "D", "v", "P", "X")
 NUM_MARKS = 8  # on a curve
-STYLE = {
+STYLE: dict[RcKeyType, Any] = {
     "pdf.fonttype": 42,  # TrueType fonts, as publishers require
     "svg.fonttype": "path",  # letters as outlines: the same everywhere
     "svg.hashsalt": "jaxpg",  # the same file from the same runs

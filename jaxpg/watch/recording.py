@@ -10,12 +10,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from envs.scenes import find_phase_plane
 from jaxpg.deploy.controller import to_physical
 from jaxpg.evaluation import play
 from jaxpg.program.backend import RUN_ONCE
 from jaxpg.program.state import Policy
 from jaxpg.store.policies import StoredPolicy
-from jaxpg.types import Metrics
 from jaxpg.watch.view import View, find_view
 
 
@@ -51,14 +51,14 @@ class Recording(NamedTuple):
     reward: np.ndarray
     value: np.ndarray
     length: np.ndarray
-    metrics: Metrics
+    metrics: dict[str, np.ndarray]
     diverged: np.ndarray
 
     @property
     def episode_return(self) -> np.ndarray:
         """Undiscounted, `[N]`."""
         alive = np.arange(len(self.reward))[:, None] < self.length
-        return np.sum(np.where(alive, self.reward, 0.0), axis=0, dtype=np.float64)
+        return np.where(alive, self.reward, 0.0).sum(axis=0, dtype=np.float64)
 
 
 def record(
@@ -74,10 +74,11 @@ def record(
     """
     look = jax.vmap(make_look(view or find_view(stored.env)))
     play = jax.jit(lambda policy: _play(stored, policy, starts, look)).lower(stored.policy).compile(RUN_ONCE)
-    return [jax.tree.map(np.asarray, play(policy)) for policy in policies]
+    return [Recording(*jax.tree.map(np.asarray, play(policy))) for policy in policies]
 
 
-def _play(stored: StoredPolicy, policy: Policy, starts: jax.Array, look: Callable[[Any], Look]) -> Recording:
+def _play(stored: StoredPolicy, policy: Policy, starts: jax.Array, look: Callable[[Any], Look]) -> tuple:
+    """The fields of a `Recording`."""
     env = stored.env
 
     def observe(step):
@@ -90,7 +91,7 @@ def _play(stored: StoredPolicy, policy: Policy, starts: jax.Array, look: Callabl
     )
     first = look(jax.vmap(env.reset)(jax.random.clone(starts)))  # the same starts on purpose
     looks = jax.tree.map(lambda x, rest: jnp.concatenate([x[None], rest]), first, after)
-    return Recording(looks, command, reward, value, episodes.length, metrics, episodes.diverged)
+    return looks, command, reward, value, episodes.length, metrics, episodes.diverged
 
 
 def make_look(view: View) -> Callable[[Any], Look]:
@@ -109,7 +110,8 @@ def make_look(view: View) -> Callable[[Any], Look]:
 
 def compute_value_map(stored: StoredPolicy, policies: Sequence[Policy], columns: int, rows: int) -> list[np.ndarray]:
     """V over the environment's phase plane, for each policy: `[rows, columns]`, row 0 at the lower end of y."""
-    plane = stored.env.phase_plane
+    plane = find_phase_plane(stored.env)
+    assert plane is not None  # whoever asks has it
     x, y = (jnp.linspace(low, high, n) for (low, high), n in zip(plane.ranges, (columns, rows), strict=True))
     obs = jax.vmap(lambda b: jax.vmap(lambda a: plane.observe(a, b))(x))(y)
     value = jax.jit(stored.value)

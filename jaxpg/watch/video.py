@@ -42,13 +42,14 @@ def render(options: RenderOptions, changes: Mapping[str, Any], say: Callable[[st
       UserError: there is no such run or policy, the environment cannot be drawn, OpenGL or a package is missing, or the
         video cannot be written. Nothing is written then.
     """
+    assert options.run is not None  # the command has asked for it
     out = Path(options.out or Path(options.run) / "video.mp4")
     format_ = movie.find_format(out)
     folder.find(options.run)
     _check_size(options)
     backend = gl.find_backend(os.environ, gl.is_working)
     with physics_cache(options.cache):
-        stored = _load_policy(options, changes)
+        stored = _load_policy(options.run, options, changes)
     with compilation_cache(options.cache, say):
         clips = play_clips(stored, options.episodes, options.seed)
     interval, seconds = choose_pace(clips[0].dt, options.speed, min(options.fps, format_.fastest))
@@ -83,9 +84,9 @@ def choose_grid(number: int) -> tuple[int, int]:
     return math.ceil(number / columns), columns
 
 
-def _load_policy(options: RenderOptions, changes: Mapping[str, Any]) -> StoredPolicy:
+def _load_policy(run: str, options: RenderOptions, changes: Mapping[str, Any]) -> StoredPolicy:
     checkpoint = "best" if options.checkpoint == "untrained" else options.checkpoint
-    stored = policies.load(options.run, checkpoint, options.agent, changes)
+    stored = policies.load(run, checkpoint, options.agent, changes)
     notes: list[str] = []
     if find_view(stored.env, notes.append).scene is None:
         reason = f": {'; '.join(notes)}" if notes else " has no robot that could be drawn"
@@ -134,6 +135,7 @@ def draw_images(
     from jaxpg.watch.canvas import Canvas
 
     scene = find_view(stored.env).scene
+    assert scene is not None  # or its policy would not have been loaded
     with Canvas(scene.model, backend, choose_grid(len(clips)), size, scene.goal_radius) as canvas:
         for step in shown_steps(clips, interval):
             yield canvas.draw([make_cell(stored, scene, one, step) for one in clips])

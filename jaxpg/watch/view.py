@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+import functools
 import math
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax
 
-from envs.scenes import PhasePlane, Scene, find_scene
-from jaxpg.watch.attempts import NotDrawn, attempt, describe_error
+from envs.base import Env
+from envs.scenes import PhasePlane, Scene, find_phase_plane, find_scene, find_time_step
+from jaxpg.watch.attempts import DrawingError, attempt, describe_error
 
 
 class View(NamedTuple):
@@ -24,46 +26,47 @@ class View(NamedTuple):
     plane: PhasePlane | None
 
 
-def find_view(env: Any, say: Callable[[str], None] = lambda line: None) -> View:
+def find_view(env: Env, say: Callable[[str], None] = lambda line: None) -> View:
     """What can be drawn of `env`; `say` takes a line for each thing that it has but that cannot be drawn."""
     state = jax.eval_shape(env.reset, jax.random.key(0))
     scene = attempt("picture of the robot", lambda: _find_scene(env, state), say)
-    if scene and scene.goal and not attempt("goal", lambda: _has_goal(scene, state), say):
-        scene = scene._replace(goal=None, goal_radius=None)
+    if scene and scene.goal:
+        has_goal = functools.partial(_has_goal, scene.goal, scene.goal_radius, state)
+        if not attempt("goal", has_goal, say):
+            scene = scene._replace(goal=None, goal_radius=None)
     return View(scene, attempt("phase portrait", lambda: _find_plane(env, state), say))
 
 
-def _find_scene(env: Any, state: Any) -> Scene | None:
+def _find_scene(env: Env, state: Any) -> Scene | None:
     scene = _ask("scene", find_scene, env)
     if scene is None:
         return None
     import mujoco  # slow to import, and not needed without a scene
 
     if not isinstance(scene.model, mujoco.MjModel):
-        raise NotDrawn(f"scene.model is a {type(scene.model).__name__}, expected a mujoco.MjModel")
+        raise DrawingError(f"scene.model is a {type(scene.model).__name__}, expected a mujoco.MjModel")
     _check_shape("scene.qpos(state)", scene.qpos, (state,), (scene.model.nq,))
-    dt = _ask("dt", lambda env: float(env.dt), env)
+    dt = _ask("dt", find_time_step, env)
     if not 0 < dt < math.inf:
-        raise NotDrawn(f"dt is {dt}, expected seconds between two actions")
+        raise DrawingError(f"dt is {dt}, expected seconds between two actions")
     return scene
 
 
-def _has_goal(scene: Scene, state: Any) -> bool:
-    _check_shape("scene.goal(state)", scene.goal, (state,), (3,))
-    radius = scene.goal_radius
+def _has_goal(goal: Callable, radius: float | None, state: Any) -> bool:
+    _check_shape("scene.goal(state)", goal, (state,), (3,))
     if radius is not None and not 0 < float(radius) < math.inf:
-        raise NotDrawn(f"scene.goal_radius is {radius}, expected metres or None")
+        raise DrawingError(f"scene.goal_radius is {radius}, expected metres or None")
     return True
 
 
-def _find_plane(env: Any, state: Any) -> PhasePlane | None:
-    plane = _ask("phase_plane", lambda env: getattr(env, "phase_plane", None), env)
+def _find_plane(env: Env, state: Any) -> PhasePlane | None:
+    plane = _ask("phase_plane", find_phase_plane, env)
     if plane is None:
         return None
     if not len(plane.labels) == len(plane.ranges) == len(plane.wraps) == 2:
-        raise NotDrawn("phase_plane must have two labels, two ranges and two values of wraps")
+        raise DrawingError("phase_plane must have two labels, two ranges and two values of wraps")
     if not all(-math.inf < low < high < math.inf for low, high in plane.ranges):
-        raise NotDrawn(f"phase_plane.ranges are {plane.ranges}, expected finite lower and upper ends")
+        raise DrawingError(f"phase_plane.ranges are {plane.ranges}, expected finite lower and upper ends")
     _check_shape("phase_plane.coordinates(state)", plane.coordinates, (state,), (2,))
     number = jax.ShapeDtypeStruct((), float)
     _check_shape("phase_plane.observe(x, y)", plane.observe, (number, number), state.obs.shape)
@@ -71,14 +74,14 @@ def _find_plane(env: Any, state: Any) -> PhasePlane | None:
 
 
 def _ask(name: str, ask: Callable, *arguments: Any) -> Any:
-    """The result of the environment's own code; an exception there becomes NotDrawn."""
+    """The result of the environment's own code; an exception there becomes DrawingError."""
     try:
         return ask(*arguments)
     except Exception as error:
-        raise NotDrawn(f"{name} raises {describe_error(error)}") from error
+        raise DrawingError(f"{name} raises {describe_error(error)}") from error
 
 
 def _check_shape(name: str, function: Callable, arguments: tuple, shape: tuple[int, ...]) -> None:
     result = _ask(name, lambda: jax.eval_shape(function, *arguments))
     if getattr(result, "shape", None) != tuple(shape):
-        raise NotDrawn(f"{name} has the shape {getattr(result, 'shape', None)}, expected {tuple(shape)}")
+        raise DrawingError(f"{name} has the shape {getattr(result, 'shape', None)}, expected {tuple(shape)}")

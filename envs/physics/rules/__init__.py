@@ -4,7 +4,7 @@ A rule takes the aval (shape and dtype) of its first result, the operands (`envs
 parameters, and gives the result, or the results as a tuple.
 
 Adding a primitive is adding one function `(aval, x, y, *, parameter, **_)` to one of the modules here, and a line to
-its RULES. A primitive without a rule raises `UnsupportedPrimitive`.
+its RULES. A primitive without a rule raises `UnsupportedPrimitiveError`.
 """
 
 from collections.abc import Callable

@@ -7,15 +7,16 @@ import numpy as np
 
 from envs.physics.arrays import Array, choose_array, is_numeric, promote
 from envs.physics.expressions import Expression
-from envs.physics.primitives import UnsupportedPrimitive
+from envs.physics.primitives import UnsupportedPrimitiveError
 from envs.physics.rules.elementwise import RULES as ELEMENTWISE
 
 
 def _dynamic_slice(aval, x, *start, slice_sizes):
     limits = np.subtract(x.shape, slice_sizes)
-    axis, index = _traced_index("dynamic_slice", start)
-    if axis is None:
+    traced = _traced_index("dynamic_slice", start)
+    if traced is None:
         return _window(x, np.clip(np.array([int(s) for s in start], int), 0, limits), slice_sizes)
+    axis, index = traced
     known = [0 if i == axis else int(s) for i, s in enumerate(start)]
     windows = [
         _window(x, np.clip([*known[:axis], at, *known[axis + 1 :]], 0, limits), slice_sizes)
@@ -26,7 +27,7 @@ def _dynamic_slice(aval, x, *start, slice_sizes):
 
 def _dynamic_update_slice(aval, x, update, *start):
     if not is_numeric(*start):
-        raise UnsupportedPrimitive("dynamic_update_slice: the place depends on the data")
+        raise UnsupportedPrimitiveError("dynamic_update_slice: the place depends on the data")
     start = np.clip(np.array([int(s) for s in start], int), 0, np.subtract(x.shape, update.shape))
     x, update = promote(x, update)
     result = x.copy()
@@ -38,12 +39,12 @@ def _window(x: Array, start, sizes) -> Array:
     return x[tuple(slice(s, s + size) for s, size in zip(start, sizes, strict=True))]
 
 
-def _traced_index(name: str, indices) -> tuple[int | None, Expression | None]:
-    """The one index that is an expression, with its place; (None, None) if all are known."""
+def _traced_index(name: str, indices) -> tuple[int, Expression] | None:
+    """The one index that is an expression, with its place; None if all are known."""
     traced = [(i, index.item()) for i, index in enumerate(indices) if isinstance(index.item(), Expression)]
     if len(traced) > 1:
-        raise UnsupportedPrimitive(f"{name}: more than one index depends on the data")
-    return traced[0] if traced else (None, None)
+        raise UnsupportedPrimitiveError(f"{name}: more than one index depends on the data")
+    return traced[0] if traced else None
 
 
 def _gather(aval, x, indices, *, dimension_numbers, slice_sizes, mode, fill_value=None, **_):
@@ -57,8 +58,8 @@ def _gather(aval, x, indices, *, dimension_numbers, slice_sizes, mode, fill_valu
         start = np.zeros(x.ndim, int)
         start[list(numbers.operand_batching_dims)] = [batch[d] for d in numbers.start_indices_batching_dims]
         traced = _traced_index("gather", [np.asarray(i, object) for i in indices[batch]])
-        if traced[0] is not None:
-            raise UnsupportedPrimitive("gather: an index depends on the data")
+        if traced is not None:
+            raise UnsupportedPrimitiveError("gather: an index depends on the data")
         start[list(numbers.start_index_map)] = indices[batch]
         outside = np.any((start < 0) | (start > limits))
         if outside and "FILL" in str(mode):
@@ -76,7 +77,7 @@ def _out_of_bounds_value(dtype):
 
 def _scatter(aval, x, indices, updates, *, dimension_numbers, mode, update_jaxpr, **_):
     if not is_numeric(indices):
-        raise UnsupportedPrimitive("scatter: an index depends on the data")
+        raise UnsupportedPrimitiveError("scatter: an index depends on the data")
     numbers = dimension_numbers
     combine = _combiner(update_jaxpr)
     x, updates = promote(x, updates)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from envs.physics.arrays import promote
-from envs.physics.primitives import UnsupportedPrimitive
+from envs.physics.primitives import UnsupportedPrimitiveError
 
 
 def _copy(aval, x, **_):
@@ -57,7 +57,7 @@ def _unstack(aval, x, *, axis):
 
 def _pad(aval, x, value, *, padding_config):
     if any(low < 0 or high < 0 for low, high, _ in padding_config):
-        raise UnsupportedPrimitive("pad: negative padding")
+        raise UnsupportedPrimitiveError("pad: negative padding")
     x, value = promote(x, value)
     result = np.full(aval.shape, value, x.dtype)
     inside = tuple(

@@ -12,10 +12,10 @@ from envs.physics.arrays import as_objects, is_numeric, pack
 from envs.physics.primitives import apply
 
 NUMERIC = {
-    "add": lambda x, axes: np.sum(x, axes),
-    "mul": lambda x, axes: np.prod(x, axes),
-    "max": lambda x, axes: np.max(x, axes),
-    "min": lambda x, axes: np.min(x, axes),
+    "add": np.sum,
+    "mul": np.prod,
+    "max": np.max,
+    "min": np.min,
     "and": lambda x, axes: np.all(x, axes) if x.dtype == bool else np.bitwise_and.reduce(x, axes),
     "or": lambda x, axes: np.any(x, axes) if x.dtype == bool else np.bitwise_or.reduce(x, axes),
 }
@@ -23,8 +23,9 @@ NUMERIC = {
 
 def _reduce(name: str, aval, x, *, axes, **_):
     """The axes combined with a binary primitive."""
-    if is_numeric(x):
-        return NUMERIC[name](x, tuple(axes)).astype(aval.dtype)
+    if is_numeric(x) or not x.size:  # the latter also of symbols: there are none
+        numbers = x if is_numeric(x) else x.astype(aval.dtype)
+        return np.asarray(NUMERIC[name](numbers, tuple(axes))).astype(aval.dtype)
     rest = [d for d in range(x.ndim) if d not in axes]
     rows = x.transpose([*rest, *axes]).reshape(-1, int(np.prod([x.shape[d] for d in axes], dtype=int)))
     combine = functools.partial(apply, name, dtype=np.dtype(aval.dtype))

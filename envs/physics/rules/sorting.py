@@ -8,7 +8,7 @@ import numpy as np
 
 from envs.physics.arrays import as_objects, is_numeric, pack
 from envs.physics.expressions import Expression
-from envs.physics.primitives import UnsupportedPrimitive, apply
+from envs.physics.primitives import UnsupportedPrimitiveError, apply
 
 
 def _find_extremum(better: str, aval, x, *, axes, index_dtype, **_):
@@ -34,7 +34,7 @@ def _first_best(better: str, items: list, index_dtype: np.dtype):
 
 def _sort(aval, *arrays, dimension, num_keys, **_):
     if not is_numeric(*arrays):
-        raise UnsupportedPrimitive("sort: the order depends on the data")
+        raise UnsupportedPrimitiveError("sort: the order depends on the data")
     order = np.lexsort(tuple(reversed(arrays[:num_keys])), axis=dimension)
     return tuple(np.take_along_axis(array, order, dimension) for array in arrays)
 

@@ -11,7 +11,7 @@ import sys
 from collections.abc import Iterable, Mapping
 from contextlib import AbstractContextManager
 from pathlib import Path
-from typing import BinaryIO
+from typing import IO
 
 from envs.hints import pip_install
 from jaxpg.errors import UserError
@@ -56,10 +56,11 @@ class Follower:
                 start_new_session=True,
                 pass_fds=(run,),  # the run folder, even if it is moved
             )
+        assert self._process.stdin is not None  # a pipe, as asked
         self._pipe = self._process.stdin
         os.set_blocking(self._pipe.fileno(), False)
 
-    def _open_log(self) -> AbstractContextManager[BinaryIO]:
+    def _open_log(self) -> AbstractContextManager[IO[bytes]]:
         return files.open_file(self._log, os.O_WRONLY | os.O_APPEND | os.O_CREAT)
 
     def write(self, values: Mapping[str, float], step: int) -> None:

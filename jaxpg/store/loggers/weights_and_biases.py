@@ -14,6 +14,7 @@ from jaxpg.store import files
 
 
 def packages() -> tuple[str, ...]:
+    """The packages that this logger needs."""
     return ("wandb",)
 
 
@@ -40,7 +41,7 @@ class WeightsAndBiases:
         import wandb
 
         self._path = folder / "wandb.json"
-        record = json.loads(files.read(self._path)) if os.path.lexists(self._path) else {"step": -1}
+        record: dict[str, Any] = json.loads(files.read(self._path)) if os.path.lexists(self._path) else {"step": -1}
         self._id = record.get("id") or os.environ.get("WANDB_RUN_ID") or secrets.token_hex(4)
         self._run = wandb.init(
             id=self._id,
