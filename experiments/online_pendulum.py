@@ -25,7 +25,7 @@ from matplotlib.figure import Figure
 
 from jaxpg.commands.ending import run_command
 from jaxpg.config.parsing import compose
-from jaxpg.program.agents import agents_of
+from jaxpg.program.agents import list_agents
 from jaxpg.program.algorithms import make_algorithm
 from jaxpg.program.environment import make_env
 from jaxpg.program.schedule import plan
@@ -46,7 +46,7 @@ def returns(*options: str) -> tuple[np.ndarray, np.ndarray]:
     config = compose(["env=pendulum", "algo=online", f"num_seeds={NUM_SEEDS}", *SIZES, *options])
     algorithm, schedule = make_algorithm(config, make_env(config)), plan(config)
     train = jax.vmap(lambda seed: train_scan(algorithm, jax.random.key(seed), schedule.num_updates))
-    _, metrics = jax.jit(train)(agents_of(config).seed)
+    _, metrics = jax.jit(train)(list_agents(config).seed)
     ends = np.linspace(0, schedule.num_updates, min(POINTS, schedule.num_updates) + 1).astype(int)
     total, episodes = (
         np.add.reduceat(np.asarray(metrics[name], float), ends[:-1], axis=1) for name in ("return_sum", "episodes")

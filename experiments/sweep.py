@@ -23,12 +23,12 @@ from jaxpg.commands.ending import run_command
 from jaxpg.config.configuration import Config
 from jaxpg.config.parsing import compose
 from jaxpg.config.sweep import Setting
-from jaxpg.program.agents import crossed
+from jaxpg.program.agents import combine
 from jaxpg.program.backend import prepare
 from jaxpg.program.compile import compile_program
 from jaxpg.program.environment import make_env
 from jaxpg.program.schedule import plan
-from jaxpg.program.state import current_policy
+from jaxpg.program.state import get_policy
 from jaxpg.store.names import rename_metrics
 
 # Drawn log-uniformly between the two; discount and lambda by what they lack of 1.
@@ -55,10 +55,10 @@ def draws(algo: Any, number: int, seed: int = 0) -> list[Setting]:
 
 def results(config: Config, settings: list[Setting], num_seeds: int) -> dict[str, np.ndarray]:
     """Mean return and metrics of every setting at the end of its training, `[settings]` by name."""
-    agents = crossed(settings, range(num_seeds))
+    agents = combine(settings, range(num_seeds))
     program = compile_program(config, make_env(config), plan(config).num_updates, agents)
     train, _ = program.advance(program.init().train)
-    episodes = program.evaluate(current_policy(train))
+    episodes = program.evaluate(get_policy(train))
     found = {"return": episodes.episode_return, **rename_metrics(episodes.metrics)}
     return {name: np.asarray(x).reshape(len(settings), -1).mean(axis=1) for name, x in found.items()}
 

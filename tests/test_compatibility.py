@@ -7,7 +7,7 @@ from wrong_sums import wrong_sums
 
 from jaxpg.compatibility import WRONG_SUMS, check_jaxlib
 from jaxpg.config.parsing import compose
-from jaxpg.program.agents import agents_of
+from jaxpg.program.agents import list_agents
 from jaxpg.program.algorithms import make_algorithm
 from jaxpg.program.environment import make_env
 from jaxpg.training import train_scan
@@ -34,5 +34,5 @@ def test_the_training_program_makes_no_lapack_call(environment):
     algorithm = make_algorithm(config, env)
     train = jax.jit(jax.vmap(lambda seed: train_scan(algorithm, jax.random.key(seed), 2)))
     with jax.debug_key_reuse(False):  # see test_vmapped_seeds_are_single_seeds
-        compiled = train.lower(agents_of(config).seed).compile().as_text()
+        compiled = train.lower(list_agents(config).seed).compile().as_text()
     assert 'custom_call_target="lapack' not in compiled

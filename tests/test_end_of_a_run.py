@@ -17,8 +17,8 @@ from jaxpg.program import compile as program
 from jaxpg.program.algorithms import make_algorithm
 from jaxpg.program.compile import compile_program
 from jaxpg.program.environment import make_env
-from jaxpg.program.schedule import described_jump, plan
-from jaxpg.program.state import state_shape
+from jaxpg.program.schedule import describe_jump, plan
+from jaxpg.program.state import make_state_shape
 from jaxpg.run import session
 from jaxpg.run.chunks import PATIENCE, NonFiniteMonitor
 from jaxpg.training import initial_state, train_chunk, train_scan
@@ -62,7 +62,7 @@ def test_lines_come_at_the_same_updates_wherever_a_run_goes_on(log_interval):
     schedule = plan(configured(f"log_interval={log_interval}"))
     ends = {*range(schedule.chunk, UPDATES, schedule.chunk), UPDATES}
     for update in range(UPDATES):
-        assert update + schedule.until_next_line(update) == min(end for end in ends if end > update)
+        assert update + schedule.updates_to_next_line(update) == min(end for end in ends if end > update)
 
 
 @pytest.mark.parametrize("agents", [(), ("num_seeds=2", "vmap_seeds=2"), ("num_envs=4", "algo.num_shards=2")])
@@ -226,9 +226,9 @@ def test_a_longer_run_goes_on_as_if_it_had_been_that_long():
 def test_what_jumps_on_resume_is_said():
     def said(before, after, update, *options):
         configs = [configured(*options, f"total_steps={STEPS * n}") for n in (before, after)]
-        return described_jump(*configs, update)
+        return describe_jump(*configs, update)
 
-    words = "from here on as in a run of 320 steps: step sizes are 55.0% of the first, not 10.0%"
+    words = "continues as in a run of 320 steps: step sizes are 55.0% of the initial ones, not 10.0%"
     assert said(20, 40, 20, "algo.final_lr=0.1") == words
     assert said(20, 40, 20, *SCHEDULED) == f"{words}; sigma is 0.2, not 0.05"
     assert said(20, 20, 10, *SCHEDULED) is None
@@ -331,7 +331,7 @@ def _updates_of_agents(folder):
     from jaxpg.store.checkpoint import Checkpoints
 
     config = configured("num_seeds=2")
-    shape = state_shape(make_algorithm(config, make_env(config)), 2)
+    shape = make_state_shape(make_algorithm(config, make_env(config)), 2)
     checkpoints = Checkpoints(folder / "checkpoints", read_only=True)
     return np.asarray(checkpoints.restore(checkpoints.latest(), shape).train.update).tolist()
 

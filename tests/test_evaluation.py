@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 
 from jaxpg.commands.evaluate import _format_results
 from jaxpg.evaluation import evaluate, play
-from jaxpg.program.state import Best, better
+from jaxpg.program.state import Best, choose_better
 from jaxpg.store.statistics import penalize_diverged
 from jaxpg.watch import closing
 from jaxpg.watch.episodes import Results
@@ -93,7 +93,7 @@ def test_rows_are_counted_apart():
 
 def test_a_return_that_is_no_number_is_never_the_best():
     old = Best({"w": jnp.zeros((2, 3))}, jnp.array([-jnp.inf, -5.0]))
-    kept = better(old, Best({"w": jnp.ones((2, 3))}, np.array([np.nan, np.nan], np.float32)))
+    kept = choose_better(old, Best({"w": jnp.ones((2, 3))}, np.array([np.nan, np.nan], np.float32)))
     jax.tree.map(np.testing.assert_array_equal, kept, old)
 
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from jaxpg.config.parsing import compose
-from jaxpg.program.algorithms import BASELINES, ESTIMATORS, make_algorithm, reinforce_method, td_method
+from jaxpg.program.algorithms import BASELINES, ESTIMATORS, make_algorithm, make_reinforce_method, make_td_method
 from jaxpg.program.environment import make_env
 from jaxpg.training import initial_state, train_scan
 from jaxpg.types import Transition
@@ -77,7 +77,7 @@ def advantages(*options):
     zero = jnp.zeros((8, 3))
     steps = Transition(zero, zero, reward, zero, zero.at[3, 0].set(1.0), zero, zero, zero, zero)
     config = configured(*options)
-    method = (reinforce_method if config.choices["algo"] == "reinforce" else td_method)(config)
+    method = (make_reinforce_method if config.choices["algo"] == "reinforce" else make_td_method)(config)
     return np.asarray(method.estimate(steps, method.weight(steps), value, next_value, squared_score).advantage)
 
 

@@ -43,30 +43,30 @@ def test_the_estimate_is_from_below_and_not_far(sizes):
     compiled = jax.jit(lambda state: train_scan(algorithm, jax.random.key(0), 2, state)).lower(state).compile()
     sizes = compiled.memory_analysis()
     taken = sizes.temp_size_in_bytes + sizes.argument_size_in_bytes + sizes.output_size_in_bytes
-    assert taken / 5 < memory.needed(config, env) < taken, (memory.needed(config, env), taken)
+    assert taken / 5 < memory.estimate_memory(config, env) < taken, (memory.estimate_memory(config, env), taken)
 
 
 def test_what_cannot_fit_is_refused_with_what_would(monkeypatch):
     config = compose(["env=quadratic", "algo=td", "num_envs=100000", "num_steps=16", "eval_episodes=2"])
     env = make_env(config)
-    need = memory.needed(config, env)
-    monkeypatch.setattr(memory, "available", lambda: need)
+    need = memory.estimate_memory(config, env)
+    monkeypatch.setattr(memory, "find_available_memory", lambda: need)
     memory.check(config, env)
-    monkeypatch.setattr(memory, "available", lambda: need // 2)
-    with pytest.raises(UserError, match=r"num_envs=100000: such a training needs .* would fit") as refusal:
+    monkeypatch.setattr(memory, "find_available_memory", lambda: need // 2)
+    with pytest.raises(UserError, match=r"num_envs=100000: this training needs at least .* would fit") as refusal:
         memory.check(config, env)
     fits = int(re.search(r"num_envs=(\d+) would fit", str(refusal.value))[1])
     assert 40_000 < fits < 50_000, "what all environments share takes as much for fewer"
     fitting = compose(["env=quadratic", "algo=td", f"num_envs={fits}", "num_steps=16", "eval_episodes=2"])
     memory.check(fitting, env)
-    monkeypatch.setattr(memory, "available", lambda: None)
+    monkeypatch.setattr(memory, "find_available_memory", lambda: None)
     memory.check(config, env)
 
 
 def test_more_agents_need_more():
     one, many = (compose(["env=quadratic", f"num_seeds={number}"]) for number in (1, 1000))
     env = make_env(one)
-    assert memory.needed(many, env) > 100 * memory.needed(one, env)
+    assert memory.estimate_memory(many, env) > 100 * memory.estimate_memory(one, env)
 
 
 def test_a_limit_of_the_process_counts():
@@ -76,7 +76,7 @@ def test_a_limit_of_the_process_counts():
     limit = 2**45
     resource.setrlimit(resource.RLIMIT_AS, (limit, before[1]))
     try:
-        assert limit in list(memory._limits())
+        assert limit in list(memory._read_limits())
     finally:
         resource.setrlimit(resource.RLIMIT_AS, before)
-    assert 2**20 < memory.available() < 2**45
+    assert 2**20 < memory.find_available_memory() < 2**45

@@ -14,7 +14,7 @@ from jaxpg.program.algorithms import make_algorithm
 from jaxpg.program.compile import compile_program
 from jaxpg.program.environment import make_env
 from jaxpg.program.schedule import plan
-from jaxpg.program.state import current_policy
+from jaxpg.program.state import get_policy
 from jaxpg.training import train_scan
 
 SIZES = ("env=quadratic", "network=linear", "num_envs=4", "num_steps=5", "total_steps=400", "env.episode_length=8")
@@ -106,7 +106,7 @@ def trained(*options, chunks=2):
     for _ in range(chunks):
         train, metrics = program.advance(train)
     assert jax.tree.map(np.shape, train) == jax.tree.map(np.shape, program.state_shape.train)
-    return train, metrics, program.evaluate(current_policy(train))
+    return train, metrics, program.evaluate(get_policy(train))
 
 
 def test_agents_side_by_side_are_the_agents_alone():

@@ -12,7 +12,7 @@ from jaxpg import normalization
 from jaxpg.evaluation import evaluate
 from jaxpg.program.algorithms import make_algorithm
 from jaxpg.program.networks import make_networks
-from jaxpg.program.state import initial_run
+from jaxpg.program.state import make_initial_run
 from jaxpg.watch import drawing
 from jaxpg.watch.clips import make_clip
 from jaxpg.watch.player import wrap_coordinates
@@ -103,7 +103,7 @@ def test_a_clip_with_fewer_frames_is_every_so_many_steps_of_the_whole(recorded):
 
 def test_the_policy_before_training_is_the_one_that_training_begins_with():
     stored = a_policy(*PENDULUM)
-    begun = jax.jit(lambda seed: initial_run(make_algorithm(stored.config, stored.env), seed).train)
+    begun = jax.jit(lambda seed: make_initial_run(make_algorithm(stored.config, stored.env), seed).train)
     same, other = (begun(np.uint32(seed)) for seed in (stored.config.run.seed, stored.config.run.seed + 1))
     found = make_untrained(stored)
     assert found.update == 0

@@ -8,10 +8,10 @@ from jaxpg.config.configuration import from_dict
 from jaxpg.config.entries import GROUPS
 from jaxpg.config.parsing import compose
 from jaxpg.config.sweep import find_sweepable_options, list_settings
-from jaxpg.program.agents import crossed, with_values
+from jaxpg.program.agents import combine, replace_values
 from jaxpg.program.algorithms import make_algorithm
 from jaxpg.program.environment import make_env
-from jaxpg.program.mapping import over_agents
+from jaxpg.program.mapping import map_over_agents
 from jaxpg.training import train_scan
 
 SIZES = ("env=quadratic", "num_envs=4", "total_steps=400", "env.episode_length=8")
@@ -29,14 +29,14 @@ def test_what_can_be_swept_has_an_effect(algo):
     env = make_env(config)
 
     def train(agent):
-        return train_scan(make_algorithm(with_values(config, agent.values), env), jax.random.key(agent.seed), 2)[0]
+        return train_scan(make_algorithm(replace_values(config, agent.values), env), jax.random.key(agent.seed), 2)[0]
 
     defaults = {
         name: NUMBERS.get(name, field.default) for name, field in find_sweepable_options(config.choices).items()
     }
     every = [defaults] + [defaults | {name: CHANGED.get(name, defaults[name] / 2)} for name in defaults]
-    agents = crossed(every, seeds=[0])
-    step = jax.jit(over_agents(train, 1))
+    agents = combine(every, seeds=[0])
+    step = jax.jit(map_over_agents(train, 1))
     trained = [step(jax.tree.map(lambda x, i=i: x[i : i + 1], agents)).params for i in range(len(every))]
     flat = [np.concatenate([np.ravel(x) for x in jax.tree.leaves(params)]) for params in trained]
     same = [name for name, params in zip(defaults, flat[1:], strict=True) if np.array_equal(params, flat[0])]

@@ -84,4 +84,4 @@ def test_on_a_mac_the_threads_are_all_cores(monkeypatch):
     monkeypatch.delenv("PJRT_NPROC", raising=False)
     monkeypatch.delattr(os, "sched_getaffinity")
     monkeypatch.setattr(os, "cpu_count", lambda: 6)
-    assert versions.num_threads() == 6
+    assert versions.count_threads() == 6

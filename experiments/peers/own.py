@@ -23,7 +23,7 @@ from jaxpg.program.compile import compile_program  # noqa: E402
 from jaxpg.program.environment import make_env  # noqa: E402
 from jaxpg.program.networks import make_networks  # noqa: E402
 from jaxpg.program.schedule import plan  # noqa: E402
-from jaxpg.program.state import current_policy  # noqa: E402
+from jaxpg.program.state import get_policy  # noqa: E402
 from jaxpg.store.cache import compilation_cache, physics_cache  # noqa: E402
 
 
@@ -45,10 +45,10 @@ def main() -> None:
     train, update = program.init().train, 0
     RECORDER.ready()
     while update < schedule.num_updates and not RECORDER.over:
-        train, _ = program.advance(train, schedule.until_next_line(update))
+        train, _ = program.advance(train, schedule.updates_to_next_line(update))
         update = int(train.update[0])
         if RECORDER.due or update >= schedule.num_updates:
-            policy = current_policy(train)
+            policy = get_policy(train)
             RECORDER.look(update * schedule.steps_per_update, lambda obs, policy=policy: run(policy, obs))
 
 

@@ -25,7 +25,7 @@ from jaxpg.deploy.controller import (
     play_observations,
 )
 from jaxpg.errors import UserError
-from jaxpg.program.agents import described
+from jaxpg.program.agents import describe_run
 from jaxpg.program.networks import make_networks
 from jaxpg.store import folder, policies
 from jaxpg.store.cache import physics_cache
@@ -227,7 +227,7 @@ def describe_origin(run: str, checkpoint: str, stored: StoredPolicy) -> dict[str
     run_folder = folder.find(run)
     which = run_folder.best if checkpoint == "best" else run_folder.checkpoints
     return {
-        "policy": f"{described(stored.config)}, {stored.describe(checkpoint)}",
+        "policy": f"{describe_run(stored.config)}, {stored.describe(checkpoint)}",
         "run": run_folder.path.resolve().name,
         "digest": Checkpoints(which, read_only=True).digest(stored.update),
     }

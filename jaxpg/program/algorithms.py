@@ -1,6 +1,6 @@
-"""The algorithms of a run, by the name that the configuration gives them.
+"""Builds the algorithm of a run from its configuration.
 
-An algorithm is a function here, `build(config, env) -> Algorithm` of one agent, and an entry with its options in
+Each algorithm is a function here, `build(config, env) -> Algorithm` for one agent, and an entry with its options in
 `jaxpg.config.entries.ALGORITHMS`.
 """
 
@@ -23,10 +23,10 @@ from jaxpg.estimators import Estimator
 from jaxpg.methods import Method
 from jaxpg.online import online_actor_critic
 from jaxpg.ppo import ppo
-from jaxpg.program.environment import training_length
+from jaxpg.program.environment import get_training_length
 from jaxpg.program.networks import make_networks
 from jaxpg.program.schedule import plan
-from jaxpg.program.sigma import labels, left_alone, log_sigma, with_sigma
+from jaxpg.program.sigma import keep_params, label_params, make_sigma_schedule, schedule_sigma
 from jaxpg.types import Algorithm
 from jaxpg.updates import scale_by_progress
 from jaxpg.vector_env import vectorize
@@ -51,57 +51,63 @@ RETURNS = {"to_go": estimators.reinforce, "whole": estimators.reinforce_whole}
 def make_algorithm(config: Config, env: Env) -> Algorithm:
     """One agent's algorithm, as pure functions."""
     algorithm = ALGORITHMS[config.choices["algo"]].make(config, env)
-    return with_sigma(algorithm, log_sigma(config)) if config.network.sigma_is == "scheduled" else algorithm
+    if config.network.sigma_is == "scheduled":
+        return schedule_sigma(algorithm, make_sigma_schedule(config))
+    return algorithm
 
 
 def make_td(config: Config, env: Env) -> Algorithm:
-    """The entry `td`."""
-    return _make(actor_critic, config, env, td_method(config))
+    """Builds the entry `td`."""
+    return _make_on_policy(actor_critic, config, env, make_td_method(config))
 
 
 def make_ppo(config: Config, env: Env) -> Algorithm:
-    """The entry `ppo`."""
+    """Builds the entry `ppo`."""
     names = ("epochs", "minibatches", "clip", "value_clip", "max_kl")
-    return _make(ppo, config, env, td_method(config), **{name: getattr(config.algo, name) for name in names})
-
-
-def make_reinforce(config: Config, env: Env) -> Algorithm:
-    """The entry `reinforce`."""
-    return _make(actor_critic, config, env, reinforce_method(config))
-
-
-def make_online(config: Config, env: Env) -> Algorithm:
-    """The entry `online`."""
-    batch = vectorize(env, config.run.num_envs, training_length(config))
-    return online_actor_critic(
-        batch, make_networks(config, env), num_steps=config.run.rollout_steps, **dataclasses.asdict(config.algo)
+    return _make_on_policy(
+        ppo, config, env, make_td_method(config), **{name: getattr(config.algo, name) for name in names}
     )
 
 
-def td_method(config: Config) -> Method:
-    """The estimator of the options of TD and PPO."""
+def make_reinforce(config: Config, env: Env) -> Algorithm:
+    """Builds the entry `reinforce`."""
+    return _make_on_policy(actor_critic, config, env, make_reinforce_method(config))
+
+
+def make_online(config: Config, env: Env) -> Algorithm:
+    """Builds the entry `online`."""
+    vector_env = vectorize(env, config.run.num_envs, get_training_length(config))
+    return online_actor_critic(
+        vector_env, make_networks(config, env), num_steps=config.run.rollout_steps, **dataclasses.asdict(config.algo)
+    )
+
+
+def make_td_method(config: Config) -> Method:
+    """The method with the options of TD or PPO."""
     algo = config.algo
     return methods.td(algo.gamma, config.run.rollout_steps, ESTIMATORS[algo.estimator](algo))
 
 
-def reinforce_method(config: Config) -> Method:
-    """The estimator of the options of REINFORCE."""
+def make_reinforce_method(config: Config) -> Method:
+    """The method with the options of REINFORCE."""
     algo = config.algo
     return methods.reinforce(algo.gamma, BASELINES[algo.baseline], RETURNS[algo.returns], algo.discounted)
 
 
-def _make(make: Callable[..., Algorithm], config: Config, env: Env, method: Method, **options: Any) -> Algorithm:
-    """`actor_critic` or `ppo` with Adam, the environments in shards if the configuration asks for them.
+def _make_on_policy(
+    make: Callable[..., Algorithm], config: Config, env: Env, method: Method, **options: Any
+) -> Algorithm:
+    """`actor_critic` or `ppo` with Adam; with the environments in shards if configured.
 
     Args:
       make: `actor_critic` or `ppo`.
-      config, env: of the run.
-      method: how it collects steps and estimates advantages.
-      options: those that only `make` has.
+      config, env: configuration and environment of the run.
+      method: how to collect steps and estimate advantages.
+      options: further options of `make`.
     """
     algo, number = config.algo, config.algo.num_shards
     algorithm = make(
-        vectorize(env, config.run.num_envs // number, training_length(config)),
+        vectorize(env, config.run.num_envs // number, get_training_length(config)),
         make_networks(config, env),
         make_optimizer(config),
         method,
@@ -116,7 +122,7 @@ def _make(make: Callable[..., Algorithm], config: Config, env: Env, method: Meth
 
 
 def make_optimizer(config: Config) -> optax.GradientTransformation:
-    """Adam for actor and critic apart, with shortened gradients and step sizes that fall with the run's progress."""
+    """Adam for actor and critic separately, with clipped gradients and step sizes that decrease over the run."""
     algo = config.algo
     horizon = plan(config).num_updates * algo.gradient_steps
 
@@ -131,4 +137,4 @@ def make_optimizer(config: Config) -> optax.GradientTransformation:
     }
     if config.network.sigma_is != "scheduled":
         return optax.multi_transform(optimizers, {"actor": "actor", "critic": "critic"})
-    return optax.multi_transform({**optimizers, "sigma": left_alone()}, labels)
+    return optax.multi_transform({**optimizers, "sigma": keep_params()}, label_params)

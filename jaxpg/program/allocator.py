@@ -1,4 +1,4 @@
-"""Memory that XLA's compiler has freed, given back to the system."""
+"""Returns memory that XLA's compiler has freed to the system."""
 
 from __future__ import annotations
 
@@ -19,18 +19,18 @@ def find_trim() -> Callable[[int], int] | None:
 
 
 def trim() -> None:
-    """Gives freed memory back to the system, if the C library can."""
+    """Returns freed memory to the system, if the C library can."""
     function = find_trim()
     if function is not None:
         function(0)
 
 
 @contextlib.contextmanager
-def trimming() -> Iterator[None]:
-    """Gives freed memory back every half second inside, and at the end.
+def trim_repeatedly() -> Iterator[None]:
+    """Inside this context, returns freed memory to the system every half second and at the end.
 
-    glibc keeps what a thread has freed for that thread, and XLA compiles in many threads. This lowers the peak of a
-    cold run of the pendulum from 1.17 to 1.00 GB, and what it keeps while it trains from 1.1 to 0.6 GB.
+    glibc keeps memory freed by a thread for that thread, and XLA compiles in many threads. Trimming lowers the peak of
+    a cold run of the pendulum from 1.17 to 1.00 GB, and its memory while training from 1.1 to 0.6 GB.
     """
     finished = threading.Event()
 

@@ -1,4 +1,4 @@
-"""What has to be settled before JAX starts its backend."""
+"""Settings that must be made before JAX starts its backend."""
 
 from __future__ import annotations
 
@@ -15,41 +15,42 @@ from jaxpg.compatibility import may_deadlock
 from jaxpg.config.configuration import LIBRARIES, Config
 from jaxpg.errors import UserError
 
-# Of LLVM. With 3, XLA's default, a training compiles a quarter longer and runs no faster.
+# LLVM's optimization levels. With 3, XLA's default, a training compiles a quarter longer and runs no faster.
 OPTIMIZED: dict[str, Any]
 RUN_ONCE: dict[str, Any]
 OPTIMIZED, RUN_ONCE = ({"xla_backend_optimization_level": level} for level in (2, 0))
 
 
 def prepare(config: Config, threads: int | None = None) -> None:
-    """Starts the backend, with the number of XLA's threads pinned, on which the bits of large reductions depend.
+    """Starts the backend with a fixed number of XLA threads, as the bits of large reductions depend on it.
 
     Args:
-      config: environments of other libraries make LAPACK calls, which need a single thread on some jaxlib releases.
-      threads: those of the run that is resumed; by default as many as there are cores.
+      config: configuration of the run. Environments of other libraries call LAPACK, which needs a single thread on some
+        jaxlib releases.
+      threads: number of threads of the run being resumed; by default `count_threads`.
 
     Raises:
-      UserError: the process's environment asks JAX for something that cannot be trained with.
+      UserError: an environment variable sets JAX up in a way that training does not support.
     """
     _check_variables()
     if threads is None and config.choices["env"] in LIBRARIES and may_deadlock(jaxlib.version.__version__):
         threads = 1
-    os.environ["PJRT_NPROC"] = str(threads or num_threads())
-    with contextlib.suppress(RuntimeError):  # where the process has computed something already, with what it has
+    os.environ["PJRT_NPROC"] = str(threads or count_threads())
+    with contextlib.suppress(RuntimeError):  # raised if the backend has already started
         jax.config.update("jax_num_cpu_devices", config.num_shards)
     try:
         jax.devices()
-    except (RuntimeError, AssertionError) as error:  # the latter, without words, where jax has no plugin for it
-        reason = (str(error).splitlines() or ["there is no such platform here; cpu is one"])[0]
+    except (RuntimeError, AssertionError) as error:  # the latter has no message, if there is no plugin for the platform
+        reason = (str(error).splitlines() or ["no such platform on this machine; use cpu"])[0]
         raise UserError(f"JAX_PLATFORMS={jax.config.values['jax_platforms']}: {reason}") from error
 
 
-def num_threads() -> int:
-    """XLA's threads: results of large reductions depend on their number, so it is pinned and recorded."""
-    asked = os.environ.get("PJRT_NPROC")
-    if asked:
-        return int(asked)
-    # The cores that this process may use; where nobody knows, as on a Mac, all.
+def count_threads() -> int:
+    """Number of XLA threads: PJRT_NPROC if it is set, else the number of cores that this process may use."""
+    variable = os.environ.get("PJRT_NPROC")
+    if variable:
+        return int(variable)
+    # macOS has no sched_getaffinity: all cores there.
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
@@ -62,10 +63,10 @@ def _check_variables() -> None:
     if threads and not (threads.isascii() and threads.isdigit() and int(threads)):
         raise UserError(f"PJRT_NPROC={threads}: expected a whole number of threads, at least 1")
     flags = os.environ.get("XLA_FLAGS")
-    if flags:  # at one that it does not know XLA ends the process
-        attempt = [sys.executable, "-c", "import jax; jax.devices()"]
-        ended = subprocess.run(attempt, capture_output=True, text=True, check=False)
-        if ended.returncode:
-            lines = [line for line in ended.stderr.splitlines() if "flag" in line.lower()]
-            reason = lines[0].rpartition("] ")[2] if lines else f"status {ended.returncode}"
+    if flags:  # XLA ends the process at an unknown flag, so try them in another one
+        command = [sys.executable, "-c", "import jax; jax.devices()"]
+        result = subprocess.run(command, capture_output=True, text=True, check=False)
+        if result.returncode:
+            lines = [line for line in result.stderr.splitlines() if "flag" in line.lower()]
+            reason = lines[0].rpartition("] ")[2] if lines else f"status {result.returncode}"
             raise UserError(f"XLA_FLAGS={flags}: XLA does not start with it ({reason})")

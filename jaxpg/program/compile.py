@@ -1,4 +1,4 @@
-"""From a configuration to the compiled functions of a training run."""
+"""Compiles the functions of a training run."""
 
 from __future__ import annotations
 
@@ -18,26 +18,26 @@ from jaxpg.config.configuration import Config
 from jaxpg.evaluation import Episodes, evaluate
 from jaxpg.nonfinite import skip_nonfinite, stop_at_nonfinite
 from jaxpg.policy import deterministic_policy
-from jaxpg.program.agents import Agents, agents_of, with_values
+from jaxpg.program.agents import Agents, list_agents, replace_values
 from jaxpg.program.algorithms import make_algorithm
-from jaxpg.program.allocator import trimming
+from jaxpg.program.allocator import trim_repeatedly
 from jaxpg.program.backend import OPTIMIZED, RUN_ONCE
-from jaxpg.program.mapping import groups_at_once, in_groups, over_agents
+from jaxpg.program.mapping import count_parallel_groups, map_in_groups, map_over_agents
 from jaxpg.program.networks import make_networks
-from jaxpg.program.state import Policy, RunState, current_policy, initial_run
+from jaxpg.program.state import Policy, RunState, get_policy, make_initial_run
 from jaxpg.training import train_chunk
 from jaxpg.types import TrainState
 
-# Evaluations during training play the same starts in every run; `jaxpg.evaluate` draws others.
+# Evaluations in training use the same starts in every run; those of `jaxpg.evaluate` differ.
 SELECTION_SEED = 2**31
 
 
 class Program(NamedTuple):
-    """The compiled functions of a run; every state and result has the agents as its leading axis `[S, ...]`.
+    """The compiled functions of a run; every state and result has a leading axis of agents, `[S, ...]`.
 
     Attributes:
-      init: `init() -> RunState`; None in the program of a run that is resumed.
-      advance: `advance(TrainState, number=chunk) -> (TrainState, metrics)`, up to a chunk; metrics are `[S, number]`.
+      init: `init() -> RunState`; None if the run is resumed.
+      advance: `advance(TrainState, number=chunk) -> (TrainState, metrics)`, at most a chunk; metrics are `[S, number]`.
       evaluate: `evaluate(Policy) -> Episodes` `[S, eval_episodes]`.
       state_shape: shapes and types of the run's state.
     """
@@ -59,57 +59,58 @@ def compile_program(
     resumed: bool = False,
     meanwhile: Callable[[], None] = lambda: None,
 ) -> Program:
-    """Traces and compiles up to `chunk` updates, the evaluation and the beginning of a run.
+    """Traces and compiles up to `chunk` updates, the evaluation and the initial state of a run.
 
-    What is compiled is for `vmap_seeds` agents; all agents are groups of as many, which share the cores. On a CPU that
-    is faster than one program for all of them, and each agent has the bits that it has alone. Seeds and swept values
-    are arguments; an agent has the bits of a run of its own with the same options swept, and but for rounding those of
-    one where they are constants of the program.
+    The program is compiled for groups of `vmap_seeds` agents, which share the cores. On a CPU this is faster than one
+    program for all agents, and gives each agent the same bits as alone. Seeds and swept values are arguments: an agent
+    has the same bits as in a run of its own with the same options swept, and up to rounding the same numbers as in a
+    run with these options as constants.
 
     Args:
-      config, env: of the run.
-      chunk: updates of one call, at most.
-      agents: by default those of the configuration.
-      resumed: the state comes from a checkpoint; `init` is not compiled.
-      meanwhile: called once while XLA compiles in other threads.
+      config, env: configuration and environment of the run.
+      chunk: maximum number of updates in one call.
+      agents: by default, the agents of the configuration.
+      resumed: whether the state comes from a checkpoint, so that `init` is not compiled.
+      meanwhile: called once, while XLA compiles in other threads.
     """
-    size, agents = config.run.vmap_seeds, agents or agents_of(config)
-    init, advance, play = (over_agents(fn, size) for fn in _of_one_agent(config, env, chunk))
-    of_group = jax.tree.map(lambda x: x[:size], agents)
-    traced = jax.jit(init).trace(of_group)
+    size, agents = config.run.vmap_seeds, agents or list_agents(config)
+    init, advance, play = (map_over_agents(fn, size) for fn in _make_agent_functions(config, env, chunk))
+    group = jax.tree.map(lambda x: x[:size], agents)
+    traced = jax.jit(init).trace(group)
     shape = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype), traced.out_info)
-    with trimming(), _compilers() as pool:
-        # Tracing holds Python's lock and compiling does not: one trace after the other, that of the longest compilation
-        # first, so that no compilation waits for another one's trace.
-        advancing = pool.submit(jax.jit(advance).lower(of_group, shape.train, number=chunk).compile, OPTIMIZED)
-        starting = None if resumed else pool.submit(traced.lower().compile, RUN_ONCE)
-        playing = pool.submit(jax.jit(play).lower(current_policy(shape.train)).compile, OPTIMIZED)
+    with trim_repeatedly(), _compiler_pool() as pool:
+        # Tracing holds Python's lock and compiling does not. So the functions are traced one after the other, starting
+        # with the one that takes longest to compile.
+        advance_future = pool.submit(jax.jit(advance).lower(group, shape.train, number=chunk).compile, OPTIMIZED)
+        start_future = None if resumed else pool.submit(traced.lower().compile, RUN_ONCE)
+        play_future = pool.submit(jax.jit(play).lower(get_policy(shape.train)).compile, OPTIMIZED)
         meanwhile()
-        start_group, advance_group, play_group = starting and starting.result(), advancing.result(), playing.result()
-    of_all = functools.partial(in_groups, size=size, at_once=groups_at_once(config))
-    advance_all = of_all(advance_group)
+        start_group = start_future and start_future.result()
+        advance_group, play_group = advance_future.result(), play_future.result()
+    map_all = functools.partial(map_in_groups, size=size, at_once=count_parallel_groups(config))
+    advance_all = map_all(advance_group)
 
     def advance_by(train, number=chunk):
         train, metrics = advance_all(agents, train, number=number)
         return train, {name: np.asarray(x)[:, :number] for name, x in metrics.items()}
 
     return Program(
-        functools.partial(of_all(start_group), agents) if start_group else None,
+        functools.partial(map_all(start_group), agents) if start_group else None,
         advance_by,
-        of_all(play_group),
+        map_all(play_group),
         jax.tree.map(lambda x: jax.ShapeDtypeStruct((len(agents.seed), *x.shape[1:]), x.dtype), shape),
     )
 
 
-def _of_one_agent(config: Config, env: Env, chunk: int) -> tuple[Callable, Callable, Callable]:
-    """`init(agent)`, `advance(agent, train, number)` and `play(policy)`, to be traced."""
+def _make_agent_functions(config: Config, env: Env, chunk: int) -> tuple[Callable, Callable, Callable]:
+    """`init(agent)`, `advance(agent, train, number)` and `play(policy)` of one agent, to be traced."""
     run, networks = config.run, make_networks(config, env)
 
     def algorithm(agent):
-        return NAN_POLICIES[run.nan_policy](make_algorithm(with_values(config, agent.values), env))
+        return NAN_POLICIES[run.nan_policy](make_algorithm(replace_values(config, agent.values), env))
 
     def init(agent):
-        return initial_run(algorithm(agent), agent.seed)
+        return make_initial_run(algorithm(agent), agent.seed)
 
     def advance(agent, train, number):
         return train_chunk(algorithm(agent), jax.random.key(agent.seed), chunk, number, train)
@@ -127,8 +128,8 @@ def _of_one_agent(config: Config, env: Env, chunk: int) -> tuple[Callable, Calla
 
 
 @contextlib.contextmanager
-def _compilers() -> Iterator[ThreadPoolExecutor]:
-    """Threads to compile in, for which an exception does not wait: XLA cannot be interrupted."""
+def _compiler_pool() -> Iterator[ThreadPoolExecutor]:
+    """Threads for compilation; exceptions do not wait for them, as XLA cannot be interrupted."""
     pool = ThreadPoolExecutor()
     try:
         yield pool

@@ -1,4 +1,4 @@
-"""The networks of a run, and the functions that its options name."""
+"""Builds the networks of a run, with the functions named by its options."""
 
 from __future__ import annotations
 
@@ -24,13 +24,13 @@ FEATURES = {
     "fourier": features.fourier,
     "radial": features.radial,
 }
-NUM_FEATURES: dict[str, Callable[[int, int], int]] = {  # of an observation's size and the order
+NUM_FEATURES: dict[str, Callable[[int, int], int]] = {  # as functions of the observation size and the order
     "identity": lambda size, order: size,
     "polynomial": lambda size, order: math.comb(size + order, order) - 1,
     "fourier": lambda size, order: (order + 1) ** size - 1,
     "radial": lambda size, order: order**size,
 }
-# A scheduled sigma is a parameter that the optimizer leads (`jaxpg.program.sigma`).
+# A scheduled sigma is a parameter, set by `jaxpg.program.sigma`.
 SIGMAS: dict[str, Callable[[float], Sigma]] = {
     "fixed": networks.fixed,
     "learned": networks.learned,
@@ -45,18 +45,18 @@ def make_networks(config: Config, env: Env) -> Networks:
 
 
 def make_mlp(options: Any, observation_size: int, action_size: int) -> Networks:
-    """The entry `mlp`."""
+    """Builds the entry `mlp`."""
     activation = ACTIVATIONS[options.activation]
-    return mlp_networks(observation_size, action_size, options.widths, activation, **_shared(options))
+    return mlp_networks(observation_size, action_size, options.widths, activation, **_make_shared_arguments(options))
 
 
 def make_linear(options: Any, observation_size: int, action_size: int) -> Networks:
-    """The entry `linear`."""
-    return linear_networks(observation_size, action_size, **_shared(options))
+    """Builds the entry `linear`."""
+    return linear_networks(observation_size, action_size, **_make_shared_arguments(options))
 
 
-def _shared(options: Any) -> dict[str, Any]:
-    """What every Gaussian policy of features is made of."""
+def _make_shared_arguments(options: Any) -> dict[str, Any]:
+    """The arguments that both kinds of networks take."""
     return {
         "features": functools.partial(FEATURES[options.features], order=options.order),
         "sigma": SIGMAS[options.sigma_is](options.sigma),

@@ -1,4 +1,4 @@
-"""A sigma that follows the run's progress (`network.sigma_is=scheduled`), and not its gradients."""
+"""A sigma that follows a schedule and no gradients (`network.sigma_is=scheduled`)."""
 
 from __future__ import annotations
 
@@ -14,8 +14,8 @@ from jaxpg.program.schedule import plan
 from jaxpg.types import Algorithm, Metrics, TrainState
 
 
-def left_alone() -> optax.GradientTransformation:
-    """No step, for parameters that something else sets; the state is their number, which checkpoints have."""
+def keep_params() -> optax.GradientTransformation:
+    """Makes no updates, for parameters that are set elsewhere; the state counts steps, and is in checkpoints."""
 
     def init(params):
         return jnp.zeros((), jnp.int32)
@@ -26,37 +26,37 @@ def left_alone() -> optax.GradientTransformation:
     return optax.GradientTransformation(init, update)
 
 
-def log_sigma(config: Config) -> optax.Schedule:
-    """log sigma after some updates of the run: from the first value to the last in equal steps, and no further."""
+def make_sigma_schedule(config: Config) -> optax.Schedule:
+    """log sigma as a function of the updates made: linear from the initial to the final value, then constant."""
     first, last = np.log(config.network.sigma), np.log(config.network.final_sigma)
     return optax.linear_schedule(first, last, plan(config).num_updates)
 
 
-def with_sigma(algorithm: Algorithm, log_sigma: optax.Schedule) -> Algorithm:
-    """The algorithm whose policy has log sigma = `log_sigma(n)` after n updates, whatever its gradients and its past.
+def schedule_sigma(algorithm: Algorithm, log_sigma: optax.Schedule) -> Algorithm:
+    """Sets log sigma of the policy to `log_sigma(n)` after n updates, whatever its gradients and history.
 
-    The optimizer does not do it: steps that it does not take, and updates that are left out, would hold it up.
+    The optimizer does not do this, as steps and updates that are skipped would delay the schedule.
     """
 
-    def settled(state: TrainState) -> TrainState:
+    def set_sigma(state: TrainState) -> TrainState:
         value = log_sigma(state.update)
-        set_sigma = lambda path, x: jnp.full_like(x, value) if _is_sigma(path) else x  # noqa: E731
-        return state._replace(params=jax.tree_util.tree_map_with_path(set_sigma, state.params))
+        replace = lambda path, x: jnp.full_like(x, value) if _is_sigma(path) else x  # noqa: E731
+        return state._replace(params=jax.tree_util.tree_map_with_path(replace, state.params))
 
     def step(state: TrainState, key: jax.Array) -> tuple[TrainState, Metrics]:
-        state, metrics = algorithm.step(settled(state), key)
-        return settled(state), metrics
+        state, metrics = algorithm.step(set_sigma(state), key)
+        return set_sigma(state), metrics
 
     return Algorithm(algorithm.init, step)
 
 
 def _is_sigma(path: Any) -> bool:
-    """Whether this is the place of a sigma that does not depend on the state, among the parameters."""
+    """Whether the parameter at this path is a sigma that does not depend on the state."""
     return jax.tree_util.keystr(path).endswith("['log_std']")
 
 
-def labels(params: Any) -> Any:
-    """Which optimizer each parameter has, where sigma has one of its own."""
+def label_params(params: Any) -> Any:
+    """The name of each parameter's optimizer; sigma has its own."""
 
     def label(path, _):
         return "sigma" if _is_sigma(path) else path[0].key

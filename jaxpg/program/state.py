@@ -1,4 +1,4 @@
-"""What a run keeps: the training state and the best policy of each agent."""
+"""The state of a run: the training state and the best policy of each agent."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from jaxpg.types import Algorithm, PyTree, TrainState
 
 
 class Policy(NamedTuple):
-    """What acting needs.
+    """The part of the state that acting needs.
 
     Attributes:
       params: `{"actor": ..., "critic": ...}`.
@@ -30,8 +30,8 @@ class Best(NamedTuple):
     """The best policy of each agent, by its mean evaluation return.
 
     Attributes:
-      policy: leaves `[S, ...]`.
-      episode_return: `[S]`; -inf before the first evaluation.
+      policy: the policies, leaves `[S, ...]`.
+      episode_return: their returns, `[S]`; -inf before the first evaluation.
     """
 
     policy: Policy
@@ -39,31 +39,31 @@ class Best(NamedTuple):
 
 
 class RunState(NamedTuple):
-    """What a checkpoint holds; all leaves have the agents as leading axis, `[S, ...]`."""
+    """The content of a checkpoint; all leaves have a leading axis of agents, `[S, ...]`."""
 
     train: TrainState
     best: Best
 
 
 def start(train: TrainState) -> RunState:
-    """The state before anything has been evaluated; also of shapes alone, under `jax.eval_shape`."""
-    return RunState(train, Best(current_policy(train), jnp.full(train.update.shape, -jnp.inf)))
+    """The state before the first evaluation."""
+    return RunState(train, Best(get_policy(train), jnp.full(train.update.shape, -jnp.inf)))
 
 
-def current_policy(train: TrainState) -> Policy:
+def get_policy(train: TrainState) -> Policy:
     """The policy as it is after the updates made so far."""
     return Policy(train.params, train.normalizer)
 
 
 def is_key(leaf: Any) -> bool:
-    """Whether an array holds random keys, which numpy does not know."""
+    """Whether an array holds random keys, which numpy does not support."""
     return jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key)
 
 
-def better(old: Best, new: Best) -> Best:
-    """Agent by agent the policy with the higher return; of equals the old one, and a NaN is not higher.
+def choose_better(old: Best, new: Best) -> Best:
+    """For each agent the policy with the higher return; the old one if they are equal or the new one is NaN.
 
-    Computed by numpy: jax would compile a program for every shape, at the first evaluation of each run.
+    Computed with numpy, as jax would compile a program for every shape at the first evaluation of each run.
     """
     improved = np.asarray(new.episode_return) > np.asarray(old.episode_return)
 
@@ -74,12 +74,12 @@ def better(old: Best, new: Best) -> Best:
     return jax.tree.map(choose, new, old)
 
 
-def initial_run(algorithm: Algorithm, seed: jax.Array) -> RunState:
-    """One agent's run before its first update."""
+def make_initial_run(algorithm: Algorithm, seed: jax.Array) -> RunState:
+    """The state of one agent's run before its first update."""
     return start(initial_state(algorithm, jax.random.key(seed)))
 
 
-def state_shape(algorithm: Algorithm, num_agents: int) -> RunState:
-    """Shapes and types of a run's state, `[S, ...]`."""
-    one = jax.eval_shape(functools.partial(initial_run, algorithm), np.uint32(0))
+def make_state_shape(algorithm: Algorithm, num_agents: int) -> RunState:
+    """The shapes and types of a run's state, `[S, ...]`."""
+    one = jax.eval_shape(functools.partial(make_initial_run, algorithm), np.uint32(0))
     return jax.tree.map(lambda x: jax.ShapeDtypeStruct((num_agents, *x.shape), x.dtype), one)

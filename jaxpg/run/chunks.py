@@ -10,7 +10,7 @@ import numpy as np
 from jaxpg.config.configuration import Config
 from jaxpg.divergence import BOUND
 from jaxpg.nonfinite import FLAGS, list_quantities
-from jaxpg.program.agents import described_agent
+from jaxpg.program.agents import describe_agent
 from jaxpg.store.folder import to_json
 from jaxpg.types import Metrics, TrainState
 
@@ -118,4 +118,4 @@ class NonFiniteMonitor:
             self._say(f"note: {problem}; {'this agent stops before it' if stops else 'such updates are skipped'}")
 
     def _describe_agent(self, agent: int) -> str:
-        return f", {described_agent(self._config, agent)}" if self._config.num_agents > 1 else ""
+        return f", {describe_agent(self._config, agent)}" if self._config.num_agents > 1 else ""

@@ -12,7 +12,7 @@ from jaxpg.config.configuration import Config
 from jaxpg.config.schema import Run
 from jaxpg.program.compile import Program
 from jaxpg.program.schedule import Schedule
-from jaxpg.program.state import Best, RunState, better, current_policy
+from jaxpg.program.state import Best, RunState, choose_better, get_policy
 from jaxpg.run.chunks import PATIENCE, NonFiniteMonitor, summarize
 from jaxpg.run.signals import StopRequests
 from jaxpg.run.terminal import Display
@@ -86,7 +86,7 @@ class Loop:
 
     def _advance(self) -> bool:
         """Trains up to the next line of metrics; returns whether any update was made."""
-        number = self._schedule.until_next_line(self.update)
+        number = self._schedule.updates_to_next_line(self.update)
         with self._watchdog.chunk(f"update {self.update + 1:,} to {self.update + number:,}"):
             train, metrics = jax.block_until_ready(self._program.advance(self._state.train, number))
         self.monitor.observe(self._state.train, metrics)
@@ -118,12 +118,12 @@ def count_updates(train: TrainState) -> int:
 
 def _evaluate(program: Program, state: RunState) -> tuple[RunState, dict[str, Any]]:
     """Evaluates the deterministic policy; returns the state with the best policy so far, and the results."""
-    policy = current_policy(state.train)
+    policy = get_policy(state.train)
     episodes = jax.tree.map(np.asarray, program.evaluate(policy))
     returns = penalize_diverged(episodes.episode_return, episodes.diverged).mean(axis=-1)
     results = {name: finite_mean(value) for name, value in rename_metrics(episodes.metrics).items()}
     results |= {"return": returns, "diverged": episodes.diverged.sum(axis=-1)}
-    best = better(state.best, Best(policy, returns.astype(np.float32)))
+    best = choose_better(state.best, Best(policy, returns.astype(np.float32)))
     return state._replace(best=best), {f"eval_{name}": to_json(value) for name, value in results.items()}
 
 

@@ -20,7 +20,7 @@ from jaxpg.program import agents, memory
 from jaxpg.program.backend import prepare
 from jaxpg.program.compile import Program, compile_program
 from jaxpg.program.environment import make_env
-from jaxpg.program.schedule import described_jump, plan
+from jaxpg.program.schedule import describe_jump, plan
 from jaxpg.program.state import RunState
 from jaxpg.run.loop import Loop, Session, count_updates, is_solved
 from jaxpg.run.signals import StopRequests
@@ -81,7 +81,7 @@ def _begin(config: Config, finish: Finish, env: Env, run_folder: RunFolder) -> i
     run_files.replace(run_folder.config, configuration.to_yaml(config))
     display = Display(schedule.total_steps, num_agents=config.num_agents)
     display.say(
-        f"{agents.described(config)}: {run.num_envs} environments x {run.num_steps} steps x "
+        f"{agents.describe_run(config)}: {run.num_envs} environments x {run.num_steps} steps x "
         f"{schedule.num_updates:,} updates = {schedule.total_steps:,} steps, into {run_folder.path}"
     )
     session = Session(config, schedule, run_folder, display)
@@ -157,7 +157,7 @@ def _continue(stored: Config, config: Config, finish: Finish, run_folder: RunFol
         return 0
     current_versions = versions.collect_versions()
     changes = versions.find_changes(recorded_versions, current_versions)
-    _announce_resume(session, update, described_jump(stored, config, update), changes)
+    _announce_resume(session, update, describe_jump(stored, config, update), changes)
     program, seconds = _compile(session, _make_env(config), resumed=True)
     state = checkpoints.restore(update, program.state_shape)
     if config.run.nan_policy == "skip":

@@ -14,7 +14,7 @@ from pathlib import Path
 
 import jaxlib.version
 
-from jaxpg.program.backend import num_threads
+from jaxpg.program.backend import count_threads
 from jaxpg.store.cache_folder import STAGING, CacheError, digest, make_private, remove_old
 
 REJECTED = "rejected"  # a file where the entries belong, on a machine that cannot load what it has compiled
@@ -88,7 +88,7 @@ class Executables:
 def machine() -> str:
     """The name of the folder for what was compiled here."""
     version, flags = jaxlib.version.__version__, os.environ.get("XLA_FLAGS", "").encode()
-    return f"jaxlib-{version}-cpu-{digest(cpu_features())}-flags-{digest(flags)}-threads-{num_threads()}"
+    return f"jaxlib-{version}-cpu-{digest(cpu_features())}-flags-{digest(flags)}-threads-{count_threads()}"
 
 
 def cpu_features() -> bytes:

@@ -14,7 +14,7 @@ from jaxpg.config import configuration
 from jaxpg.config.configuration import Config
 from jaxpg.errors import UserError
 from jaxpg.policy import deterministic_policy, value_function
-from jaxpg.program.agents import alone, described_agent
+from jaxpg.program.agents import describe_agent, select_agent
 from jaxpg.program.backend import prepare
 from jaxpg.program.environment import make_env
 from jaxpg.program.networks import make_networks
@@ -103,7 +103,7 @@ def load_several(
     agent_policies = {
         kind: (jax.tree.map(lambda x: np.asarray(x)[agent], policy), at) for kind, (policy, at) in policies.items()
     }
-    one = make_stored_policy(alone(config, agent), env, *agent_policies["best"], described_agent(config, agent))
+    one = make_stored_policy(select_agent(config, agent), env, *agent_policies["best"], describe_agent(config, agent))
     evaluated = {"best": bool(np.isfinite(best.episode_return[agent])), "last": True}
     return [
         one._replace(policy=agent_policies[kind][0], update=agent_policies[kind][1], has_evaluation=evaluated[kind])

@@ -12,7 +12,7 @@ from typing import Any
 
 import jax
 
-from jaxpg.program.backend import num_threads
+from jaxpg.program.backend import count_threads
 
 OUR_ENTRIES = ("jaxpg", "commit")  # may change without changing the bits
 PACKAGES = ("jax", "jaxlib", "mujoco", "mujoco-mjx", "brax", "flax", "optax", "orbax-checkpoint", "numpy")
@@ -23,7 +23,7 @@ def collect_versions() -> dict[str, Any]:
     """What the bits of a run depend on besides its options; for a checkout of jaxpg also its commit."""
     ours = {"jaxpg": importlib.metadata.version("jaxpg"), "commit": find_commit()}
     packages = {name: importlib.metadata.version(name) for name in PACKAGES}
-    machine = {"python": platform.python_version(), "machine": platform.machine(), "threads": num_threads()}
+    machine = {"python": platform.python_version(), "machine": platform.machine(), "threads": count_threads()}
     devices = f"{jax.device_count()} {jax.default_backend()}"
     return ours | packages | machine | {"devices": devices, "xla_flags": os.environ.get("XLA_FLAGS", "")}
 

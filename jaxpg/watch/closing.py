@@ -80,7 +80,7 @@ def draw_learning_curve(session: Session) -> list[dict[str, Any]]:
 
 
 def _draw_curve(session: Session, lines: list[dict[str, Any]]) -> None:
-    config, title, picture = session.config, agents.described(session.config), io.BytesIO()
+    config, title, picture = session.config, agents.describe_run(session.config), io.BytesIO()
     if config.sweep:
         figures.draw_sweep_curves(lines, picture, title, results.select_curves(config, lines))
     else:

@@ -109,7 +109,7 @@ def describe(inspection: Inspection) -> str:
         f"{number} {problem.word if problem else 'sound'}" for number, problem in inspection.checkpoints.items()
     ]
     rows = {
-        "run": agents.described(inspection.config),
+        "run": agents.describe_run(inspection.config),
         "progress": f"{done:,} of {total:,} steps, " + ("finished" if inspection.finished else "not finished"),
         "checkpoints": ", ".join(checkpoints) or "none",
     }

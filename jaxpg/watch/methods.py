@@ -13,7 +13,7 @@ import numpy as np
 
 from jaxpg.config import configuration
 from jaxpg.errors import UserError
-from jaxpg.program.agents import alone
+from jaxpg.program.agents import select_agent
 from jaxpg.store import config_file, folder
 from jaxpg.store.statistics import interquartile_mean
 from jaxpg.watch.curves import PANELS
@@ -142,7 +142,7 @@ def _read_agents(path: str) -> Iterator[Agent]:
     config = config_file.load(run_folder.config)
     lines = folder.read_metrics(run_folder, config.num_agents)
     for i in range(config.num_agents):
-        agent_config = alone(config, i)
+        agent_config = select_agent(config, i)
         curves = {
             metric: {line["steps"]: value for line in lines for value in _find_value(line, metric, i)}
             for metric in PANELS

@@ -89,7 +89,7 @@ def build_report(run_folder: RunFolder, config: Config, stages: Stages) -> Json:
     agent_row = [["episodes of", stored.agent]] if config.num_agents > 1 else []
     data = {
         "kind": "run",
-        "title": agents.described(config),
+        "title": agents.describe_run(config),
         "facts": [*_describe_progress(config, lines), *agent_row, ["run folder", str(run_folder.path)]],
         "head": recordings
         and try_part("table of policies", lambda: _make_policy_table(config, stages, recordings, references)),

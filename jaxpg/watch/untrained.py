@@ -7,7 +7,7 @@ import numpy as np
 
 from jaxpg.program.algorithms import make_algorithm
 from jaxpg.program.backend import RUN_ONCE
-from jaxpg.program.state import current_policy, initial_run
+from jaxpg.program.state import get_policy, make_initial_run
 from jaxpg.store.policies import StoredPolicy
 
 
@@ -15,7 +15,7 @@ def make_untrained(stored: StoredPolicy) -> StoredPolicy:
     """The same agent before its first update."""
 
     def initial(seed):
-        return current_policy(initial_run(make_algorithm(stored.config, stored.env), seed).train)
+        return get_policy(make_initial_run(make_algorithm(stored.config, stored.env), seed).train)
 
     seed = np.uint32(stored.config.run.seed)
     policy = jax.jit(initial).lower(seed).compile(RUN_ONCE)(seed)

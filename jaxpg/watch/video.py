@@ -15,7 +15,7 @@ import numpy as np
 from envs.scenes import Scene
 from jaxpg.config.command_options import RenderOptions
 from jaxpg.errors import UserError
-from jaxpg.program.agents import described
+from jaxpg.program.agents import describe_run
 from jaxpg.store import folder, policies
 from jaxpg.store.cache import compilation_cache, physics_cache
 from jaxpg.store.policies import StoredPolicy
@@ -56,7 +56,7 @@ def render(options: RenderOptions, changes: Mapping[str, Any], say: Callable[[st
     movie.write(out, draw_images(stored, clips, interval, (options.width, options.height), backend), seconds)
     number = len(shown_steps(clips, interval))
     returns = " ".join(f"{one.episode_return:.1f}" for one in clips)
-    say(f"{described(stored.config)}, {stored.describe(options.checkpoint)}")
+    say(f"{describe_run(stored.config)}, {stored.describe(options.checkpoint)}")
     say(f"returns  {returns}")
     say(f"{out}  {number} pictures, {float(number * seconds):.2f} s at {float(1 / seconds):.4g} a second")
 
