@@ -38,6 +38,10 @@ def number(default: float | None, help: str, **bounds: Any) -> Any:
 class Common:
     """Options shared by all algorithms, and defaults of those that some lack."""
 
+    gamma: float = number(0.99, "discount", at_least=0, at_most=1)
+    reward_scale: float = number(1.0, "factor on the rewards for learning", above=0)
+    normalize_observations: bool = option(True, "normalize observations by their running mean and deviation")
+
     whole_episodes: ClassVar[bool] = False  # whether a rollout is a whole episode
     keeps_rollouts: ClassVar[bool] = True  # whether a whole rollout is in memory
     num_shards: ClassVar[int] = 1
@@ -47,9 +51,6 @@ class Common:
     has_schedules: ClassVar[bool] = True  # whether step sizes and sigma may follow the run's progress
     final_lr: ClassVar[float] = 1.0
     normalize_advantages: ClassVar[bool] = False
-    gamma: float = number(0.99, "discount", at_least=0, at_most=1)
-    reward_scale: float = number(1.0, "factor on the rewards for learning", above=0)
-    normalize_observations: bool = option(True, "normalize observations by their running mean and deviation")
 
 
 @dataclass(frozen=True)
