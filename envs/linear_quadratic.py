@@ -1,13 +1,12 @@
-"""A linear-quadratic problem, on which everything about a linear-Gaussian policy is known in closed form.
+"""A linear-quadratic problem, for which everything about a linear-Gaussian policy has a closed form.
 
     s_{t+1} = A s_t + B a_t + w_t,    w_t ~ N(0, W),    s_0 ~ N(m_0, S_0)
     r_t     = -(s_{t+1}' Q s_{t+1} + a_t' R a_t)
     a_t     ~ N(K s_t + k, sigma^2 I)
 
 for T steps, with discount gamma. Under the policy the value is quadratic in the state, V_t(s) = -(s' P_t s + 2 p_t' s +
-c_t), and comes from a recursion backwards in time; the states are Gaussian, and their moments come from a recursion
-forwards. Both together give J and its gradient. All of this is plain numpy in float64: it is what estimators are tested
-against.
+c_t), and follows from a backward recursion; the states are Gaussian, and their moments follow from a forward recursion.
+Together they give J and its gradient. Everything is plain numpy in float64, as a reference for testing estimators.
 """
 
 from __future__ import annotations
@@ -26,7 +25,7 @@ class Problem:
       A, B: dynamics, `[n, n]` and `[n, m]`.
       Q, R: costs of the next state and of the action, symmetric, `[n, n]` and `[m, m]`; R positive definite.
       W: covariance of the noise on the state, `[n, n]`.
-      initial_mean, initial_covariance: of s_0, `[n]` and `[n, n]`.
+      initial_mean, initial_covariance: mean and covariance of s_0, `[n]` and `[n, n]`.
       horizon: T.
       discount: gamma, in [0, 1].
     """
@@ -58,20 +57,20 @@ class Quadratic(NamedTuple):
     c: float
 
     def __call__(self, x: np.ndarray) -> np.ndarray:
-        """The value at `[..., n]`, `[...]`."""
+        """The value `[...]` at x, `[..., n]`."""
         return -(np.einsum("...i,ij,...j", x, self.P, x) + 2 * x @ self.p + self.c)
 
 
 def values(problem: Problem, policy: Policy) -> list[Quadratic]:
     """V_t(s) for t = 0 ... T, each a `Quadratic` of s; V_T = 0, V_t = `backup` of V_{t+1}."""
-    found = [zero(problem)]
+    quadratics = [zero(problem)]
     for _ in range(problem.horizon):
-        found.append(backup(problem, policy, found[-1]))
-    return found[::-1]
+        quadratics.append(backup(problem, policy, quadratics[-1]))
+    return quadratics[::-1]
 
 
 def zero(problem: Problem) -> Quadratic:
-    """The value of every state when no reward is to come."""
+    """The value of every state after the last reward: 0."""
     return Quadratic(np.zeros_like(problem.A), np.zeros(len(problem.A)), 0.0)
 
 
@@ -90,9 +89,9 @@ def backup(problem: Problem, policy: Policy, following: Quadratic) -> Quadratic:
 
 
 def action_value(problem: Problem, following: Quadratic) -> Quadratic:
-    """(s, a) -> E[r_t + gamma following(s_{t+1}) | s_t = s, a_t = a], of the vector that joins s and a.
+    """(s, a) -> E[r_t + gamma following(s_{t+1}) | s_t = s, a_t = a], a function of s and a concatenated.
 
-    Q_t is that of V_{t+1}. With following = -(x' P x + 2 p' x + c), M = Q + gamma P, and E = (A, B) side by side:
+    With following = V_{t+1} this is Q_t. With following = -(x' P x + 2 p' x + c), M = Q + gamma P and E = (A, B):
 
         E' M E + diag(0, R),    gamma E' p,    tr(M W) + gamma c
     """
@@ -106,26 +105,26 @@ def action_value(problem: Problem, following: Quadratic) -> Quadratic:
 
 
 def lambda_targets(problem: Problem, policy: Policy, critic: list[Quadratic], lambda_: float) -> list[Quadratic]:
-    """What TD(lambda) bootstraps from at s_{t+1}, on average, for t = 0 ... T - 1.
+    """The mean value from which TD(lambda) bootstraps at s_{t+1}, for t = 0 ... T - 1.
 
         following_t = (1 - lambda) critic_{t+1} + lambda E[G^lambda_{t+1} | s_{t+1}]
 
-    lambda = 0 is the critic itself, lambda = 1 the policy's own value, whatever the critic says.
+    lambda = 0 gives the critic itself; lambda = 1 gives the value of the policy, whatever the critic.
 
     Args:
-      problem, policy: as above.
-      critic: T + 1 values that somebody believes in, exact or not; the last one is of states in which all is over.
-      lambda_: in [0, 1].
+      problem, policy: as in `backup`.
+      critic: T + 1 estimated values, exact or not; the last one is for states after the end.
+      lambda_: lambda, in [0, 1].
     """
 
     def mix(x, y):
         return (1 - lambda_) * x + lambda_ * y
 
-    target, found = critic[-1], []
-    for believed in critic[:0:-1]:
-        found.append(Quadratic(mix(believed.P, target.P), mix(believed.p, target.p), mix(believed.c, target.c)))
-        target = backup(problem, policy, found[-1])
-    return found[::-1]
+    target, targets = critic[-1], []
+    for value in critic[:0:-1]:
+        targets.append(Quadratic(mix(value.P, target.P), mix(value.p, target.p), mix(value.c, target.c)))
+        target = backup(problem, policy, targets[-1])
+    return targets[::-1]
 
 
 def objective(problem: Problem, policy: Policy) -> float:
@@ -140,17 +139,17 @@ def state_moments(problem: Problem, policy: Policy) -> list[tuple[np.ndarray, np
     F, drift = A + B @ policy.K, B @ policy.k
     noise = policy.sigma**2 * B @ B.T + problem.W
     mean, covariance = problem.initial_mean, problem.initial_covariance
-    found = []
+    moments = []
     for _ in range(problem.horizon):
-        found.append((mean, covariance + np.outer(mean, mean)))
+        moments.append((mean, covariance + np.outer(mean, mean)))
         mean, covariance = F @ mean + drift, F @ covariance @ F.T + noise
-    return found
+    return moments
 
 
 def gradient(
     problem: Problem, policy: Policy, following: list[Quadratic] | None = None, discounted: bool = True
 ) -> Policy:
-    """The gradient of J with respect to K, k and log sigma (in the place of sigma), by the policy-gradient theorem.
+    """The gradient of J with respect to K, k and log sigma (returned as `sigma`), by the policy-gradient theorem.
 
         dJ/dK         = sum_t gamma^t E[g_t(s_t) s_t'],    g_t(s) = -2 (P_aa (K s + k) + P_as s + p_a)
         dJ/dk         = sum_t gamma^t E[g_t(s_t)]
@@ -159,11 +158,11 @@ def gradient(
     where g_t(s) = E[grad_a Q_t(s, a)], and P, p are those of Q_t, the `action_value` of V_{t+1}.
 
     Args:
-      problem, policy: as above.
-      following: T quadratics in the place of V_{t+1}: those of `lambda_targets` give the mean of the gradient that
-        TD(lambda) estimates with a critic that is wrong. None: the policy's own values.
-      discounted: without it the factors gamma^t are left out, as in the lesson's section 3 and in most programs. That
-        sum is the mean of the estimators that leave them out; it is not the gradient of J.
+      problem, policy: as in `backup`.
+      following: T quadratics to use instead of V_{t+1}; those of `lambda_targets` give the mean of TD(lambda)'s
+        estimate with a wrong critic. None uses the values of the policy.
+      discounted: if False, the factors gamma^t are left out, as in the lesson's section 3 and in most programs. The
+        result is then the mean of the estimators without these factors, not the gradient of J.
     """
     K, k, sigma = policy
     n = len(problem.A)
@@ -180,12 +179,12 @@ def gradient(
 
 
 def best_policy(problem: Problem, sigma: float) -> Policy:
-    """The K and k of the largest J among the policies that are the same at every step, with this sigma.
+    """The K and k with the largest J among the policies that do not change with time, for a given sigma.
 
-    Found by following the gradient in closed form, from the first of the `riccati_gains`; J is not concave in K, so it
-    is a local best only. Raises RuntimeError where the search does not end.
+    The search follows the closed-form gradient from the first of the `riccati_gains`. J is not concave in K, so the
+    result is a local optimum. Raises RuntimeError if the search does not converge.
     """
-    import scipy.optimize  # slow to import, and seldom needed
+    import scipy.optimize  # slow to import, and rarely needed
 
     n, m = problem.B.shape
 
@@ -197,16 +196,16 @@ def best_policy(problem: Problem, sigma: float) -> Policy:
         return -objective(problem, unpack(x)), -np.concatenate([slope.K.ravel(), slope.k])
 
     start = np.concatenate([riccati_gains(problem)[0].ravel(), np.zeros(m)])
-    found = scipy.optimize.minimize(loss, start, jac=True, method="BFGS", options={"gtol": 1e-7})
-    if not found.success:
-        raise RuntimeError(f"no best policy found: {found.message}")
-    return unpack(found.x)
+    result = scipy.optimize.minimize(loss, start, jac=True, method="BFGS", options={"gtol": 1e-7})
+    if not result.success:
+        raise RuntimeError(f"no best policy found: {result.message}")
+    return unpack(result.x)
 
 
 def riccati_gains(problem: Problem) -> list[np.ndarray]:
-    """The optimal K_t for t = 0 ... T - 1: the policy that nothing beats, deterministic and different at each step.
+    """The optimal K_t for t = 0 ... T - 1: the best policy of all, deterministic and different at each step.
 
-    K_t = -P_aa^-1 P_as    of Q_t, the `action_value` of what the later gains earn
+    K_t = -P_aa^-1 P_as    of Q_t, the `action_value` with the value of the later gains
     """
     n, m = problem.B.shape
     following, gains = zero(problem), []
@@ -218,7 +217,7 @@ def riccati_gains(problem: Problem) -> list[np.ndarray]:
 
 
 def optimum(problem: Problem) -> float:
-    """J of the `riccati_gains`, the largest there is: E[V_0(s_0)]."""
+    """J of the `riccati_gains`, the largest possible: E[V_0(s_0)]."""
     following = zero(problem)
     for K in reversed(riccati_gains(problem)):
         following = backup(problem, Policy(K, np.zeros(len(K)), 0.0), following)

@@ -1,6 +1,6 @@
 """A linear-quadratic problem as an environment: the state is observed, and nothing ever terminates.
 
-`envs.linear_quadratic` has the problem's equations and its closed forms. Actions have no limits.
+`envs.linear_quadratic` has the equations and closed forms of the problem. Actions have no limits.
 """
 
 from __future__ import annotations
@@ -21,13 +21,13 @@ from envs.options import option
 class QuadraticConfig:
     """Options of the linear-quadratic problem; the defaults are the lesson's example, section 8.3.
 
-    With more than one variable each pulls the one before it: A = I + 0.1 N, with N = 1 above the diagonal.
+    With several variables, each drives the one before it: A = I + 0.1 N, with N = 1 above the diagonal.
     """
 
-    state_size: int = option(1, "variables of the state, each with an action of its own", at_least=1, at_most=100)
-    start: float = option(0.5, "mean of every variable at the start")
-    start_spread: float = option(0.0, "standard deviation of every variable at the start", at_least=0)
-    noise: float = option(0.0, "standard deviation of the noise on the state in each step", at_least=0)
+    state_size: int = option(1, "variables of the state, each with its own action", at_least=1, at_most=100)
+    start: float = option(0.5, "initial mean of every variable")
+    start_spread: float = option(0.0, "initial standard deviation of every variable", at_least=0)
+    noise: float = option(0.0, "standard deviation of the noise on the state per step", at_least=0)
     action_cost: float = option(0.01, "weight of the squared action", above=0)
     episode_length: int = option(50, "steps until the time limit", at_least=1)
 
@@ -38,7 +38,7 @@ _POLICY = {
     "network.squash": False,
     "algo.normalize_observations": False,
 }
-_QUADRATIC = {"network.features": "polynomial", "network.order": 2}  # the critic can be the value function itself
+_QUADRATIC = {"network.features": "polynomial", "network.order": 2}  # the value function is of this form
 TRAINING = {
     "td": {
         **_POLICY,
@@ -70,7 +70,7 @@ TRAINING = {
 
 
 def chain(config: QuadraticConfig, discount: float = 0.99) -> Problem:
-    """The problem that the environment's options describe; by default the lesson's."""
+    """The problem with these options; by default the lesson's."""
     eye = np.eye(config.state_size)
     return Problem(
         A=eye + 0.1 * np.eye(config.state_size, k=1),
@@ -86,10 +86,10 @@ def chain(config: QuadraticConfig, discount: float = 0.99) -> Problem:
 
 
 class LinearQuadratic:
-    """A `Problem` as an environment of brax's interface; its horizon is the caller's time limit.
+    """A `Problem` as an environment with brax's interface; the caller limits episodes to its horizon.
 
     Args:
-      problem: what to play. Its noise is drawn from a key that the state carries; without noise there is none.
+      problem: the problem. With noise, the state carries a random key for it.
     """
 
     def __init__(self, problem: Problem):
@@ -108,7 +108,7 @@ class LinearQuadratic:
 
     @property
     def references(self) -> dict[str, float]:
-        """What an episode can earn at best, on average; undiscounted, as returns are."""
+        """The largest possible mean return of an episode, undiscounted."""
         return {"best possible": optimum(dataclasses.replace(self.problem, discount=1.0))}
 
     def reset(self, rng: jax.Array) -> State:
@@ -132,11 +132,11 @@ class LinearQuadratic:
 
 
 def _root(covariance: np.ndarray) -> np.ndarray:
-    """A symmetric matrix whose square is the covariance, which may be singular."""
+    """The symmetric square root of a covariance, which may be singular."""
     squares, axes = np.linalg.eigh(covariance)
     return axes * np.sqrt(np.maximum(squares, 0)) @ axes.T
 
 
 def make(config: QuadraticConfig) -> LinearQuadratic:
-    """The environment that the options describe."""
+    """The environment with these options."""
     return LinearQuadratic(chain(config))

@@ -18,7 +18,7 @@ from processes import outcome
 import envs
 from envs.physics import PHYSICS, MujocoModelError, compile_step
 from envs.physics.callback import Simulations
-from envs.physics.fields import INPUTS, OUTPUTS, types_of
+from envs.physics.fields import INPUTS, OUTPUTS, find_types
 from jaxpg.actor_critic import actor_critic
 from jaxpg.estimators import gae
 from jaxpg.methods import td
@@ -88,7 +88,7 @@ def test_nothing_is_left_of_others():
     simulations = Simulations(model, 2, INPUTS, OUTPUTS)
 
     def step(places):
-        return simulations.results(types_of(model, OUTPUTS), *(x[places] for x in arrays))
+        return simulations.compute(find_types(model, OUTPUTS), *(x[places] for x in arrays))
 
     for name, here, elsewhere in zip(OUTPUTS, step(np.arange(30)), step(order), strict=True):
         np.testing.assert_array_equal(here[order], elsewhere, err_msg=name)

@@ -11,7 +11,7 @@ import pytest
 
 import envs
 from envs.physics import PHYSICS, compile_step
-from envs.physics.fields import OUTPUTS, types_of
+from envs.physics.fields import OUTPUTS, find_types
 from envs.physics.models import import_mjx, put_model
 
 FREE = models.chain('<body pos="0 0 1"><freejoint/><geom size="0.1"/></body>')
@@ -97,9 +97,9 @@ def test_real_numbers_are_what_they_are_in_float32(physics):
         ),
         (("qpos", "qvel", "model.opt.gravty"), ("qpos",), "did you mean 'model.opt.gravity'"),
         (("qpos", "qvel", "model.nq"), ("qpos",), "unknown input 'model.nq'"),
-        (("qpos", "qvel", "qacc"), ("qpos",), "^qacc is what the step computes"),
+        (("qpos", "qvel", "qacc"), ("qpos",), "^qacc is computed by the step"),
         (("qpos", "qvel", "qpos"), ("qpos",), "^qpos is named twice"),
-        ((), ("qpos",), "the inputs name none"),
+        ((), ("qpos",), "a step needs at least one input"),
         (("qpos", "qvel"), ("qpos", "sitexpos"), "unknown output 'sitexpos': did you mean 'site_xpos'"),
         (("qpos", "qvel"), ("model.body_mass",), "unknown output 'model.body_mass'"),
     ],
@@ -112,8 +112,8 @@ def test_a_wrong_name_is_named(physics, inputs, outputs, message):
 @pytest.mark.parametrize(
     ("field", "physics", "message"),
     [
-        ("model.light_intensity", "mjx", "MJX does not compute with a changed model.light_intensity"),
-        ("model.light_intensity", "scalar", "MJX does not compute with a changed model.light_intensity"),
+        ("model.light_intensity", "mjx", "MJX treats model.light_intensity as a constant"),
+        ("model.light_intensity", "scalar", "MJX treats model.light_intensity as a constant"),
         ("model.hfield_data", "mujoco", "model.hfield_data: with physics 'mujoco' it cannot differ"),
     ],
 )
@@ -128,5 +128,5 @@ def test_outputs_are_the_public_fields_of_mjx_data():
     data = import_mjx().make_data(put_model(model))
     public = {name: x for name, x in vars(data).items() if not name.startswith("_")}
     assert set(OUTPUTS) == set(public) - {"history", "plugin_state", "userdata"}
-    for name, wanted in zip(OUTPUTS, types_of(model, OUTPUTS), strict=True):
+    for name, wanted in zip(OUTPUTS, find_types(model, OUTPUTS), strict=True):
         assert (public[name].shape, public[name].dtype) == (wanted.shape, wanted.dtype), name

@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from envs.physics import MujocoModelError, UnsupportedPrimitiveError, compile_step, step
 from envs.physics.interpreter import trace
 from envs.physics.models import put_model
-from envs.physics.obstacles import colliding_geoms, obstacles
+from envs.physics.obstacles import find_colliding_geoms, find_obstacles
 
 SHAPES = {
     "plane": 'type="plane" size="1 1 0.1"',
@@ -55,19 +55,19 @@ def test_a_glance_tells_what_tracing_tells(first, second):
     try:
         trace(*_traced(model))
     except UnsupportedPrimitiveError:
-        assert obstacles(model)
+        assert find_obstacles(model)
     else:
-        assert not obstacles(model)
+        assert not find_obstacles(model)
 
 
 def _traced(model):
-    function, example = step.single_step(model, ("qpos", "qvel", "ctrl"), ("qpos", "qvel"))
+    function, example = step.make_single_step(model, ("qpos", "qvel", "ctrl"), ("qpos", "qvel"))
     return function, *example
 
 
 @pytest.mark.parametrize("name", [*models.SHIPPED, *models.MJCF, *models.CONSTRAINED, "panda", "panda with limits"])
 def test_models_with_scalar_equations_have_no_obstacle(name):
-    assert obstacles(models.make(name)) == []
+    assert find_obstacles(models.make(name)) == []
 
 
 @st.composite
@@ -103,7 +103,7 @@ def test_colliding_geoms_are_mujocos(xml):
     model = mujoco.MjModel.from_xml_string(xml)
     data = mujoco.MjData(model)
     mujoco.mj_forward(model, data)
-    assert {frozenset(pair) for pair in colliding_geoms(model)} == {
+    assert {frozenset(pair) for pair in find_colliding_geoms(model)} == {
         frozenset(map(int, contact.geom)) for contact in data.contact
     }
 
@@ -152,9 +152,9 @@ def test_a_glance_comes_before_tracing(monkeypatch):
 def test_disabled_constraints_are_no_obstacle():
     for flags in ("constraint", "limit"):
         option = f'<option><flag {flags}="disable"/></option>'
-        assert obstacles(mujoco.MjModel.from_xml_string(models.chain(models.LIMITED, option=option))) == []
+        assert find_obstacles(mujoco.MjModel.from_xml_string(models.chain(models.LIMITED, option=option))) == []
     box = touching("plane", "box", '<option><flag contact="disable"/></option>')
-    assert obstacles(mujoco.MjModel.from_xml_string(box)) == []
+    assert find_obstacles(mujoco.MjModel.from_xml_string(box)) == []
 
 
 def test_rangefinders_without_a_material_are_refused_in_one_line():

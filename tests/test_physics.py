@@ -23,7 +23,7 @@ from envs.physics import (
     load_spec,
 )
 from envs.physics import step as physics_step
-from envs.physics.step import single_step
+from envs.physics.step import make_single_step
 
 STATE = ("qpos", "qvel")
 
@@ -34,7 +34,7 @@ def in_float32(arrays):
 
 def by_mjx(model, states):
     """The same by `mjx.step`, one state after the other: many models are very slow when they are batched."""
-    step = jax.jit(single_step(model, (*STATE, "ctrl"), STATE)[0])
+    step = jax.jit(make_single_step(model, (*STATE, "ctrl"), STATE)[0])
     return [np.stack(x) for x in zip(*(step(*map(jnp.asarray, s)) for s in zip(*states, strict=True)), strict=True)]
 
 

@@ -12,7 +12,7 @@ from test_scalarize import CASES
 import envs
 from envs.physics import step
 from envs.physics.interpreter import trace
-from envs.physics.storage import from_text, kept_in, name_of, to_text
+from envs.physics.storage import from_text, make_name, to_text, use_store
 from jaxpg.store import cache_folder, texts
 from jaxpg.store.cache import physics_cache
 
@@ -30,13 +30,13 @@ def folder(monkeypatch, tmp_path):
 @pytest.fixture
 def made(monkeypatch):
     """The models whose step was traced."""
-    models, single_step = [], step.single_step
+    models, make_single_step = [], step.make_single_step
 
     def counted(model, *ends):
         models.append(model)
-        return single_step(model, *ends)
+        return make_single_step(model, *ends)
 
-    monkeypatch.setattr(step, "single_step", counted)
+    monkeypatch.setattr(step, "make_single_step", counted)
     return models
 
 
@@ -70,8 +70,8 @@ def test_other_text_is_no_program():
 
 def test_the_second_time_nothing_is_traced(folder, made):
     with physics_cache(True):
-        first = step.scalar_program(MODEL, *ENDS)
-        second = step.scalar_program(MODEL, *ENDS)
+        first = step.make_scalar_program(MODEL, *ENDS)
+        second = step.make_scalar_program(MODEL, *ENDS)
     assert len(made) == 1
     assert len(list(folder.iterdir())) == 1
     assert lowered(first) == lowered(second)
@@ -79,25 +79,25 @@ def test_the_second_time_nothing_is_traced(folder, made):
 
 def test_outside_of_it_nothing_is_kept(folder, made):
     with physics_cache(False):
-        step.scalar_program(MODEL, *ENDS)
+        step.make_scalar_program(MODEL, *ENDS)
     assert not folder.exists()
     with physics_cache(True):
         pass
-    step.scalar_program(MODEL, *ENDS)
+    step.make_scalar_program(MODEL, *ENDS)
     assert list(folder.iterdir()) == []
     assert len(made) == 2
 
 
 def test_another_program_has_another_name(monkeypatch):
     heavier = envs.REGISTRY["pendulum"].build(envs.REGISTRY["pendulum"].config(mass=2.0)).model
-    names = {name_of(MODEL, *ENDS), name_of(heavier, *ENDS)}
-    names |= {name_of(MODEL, ENDS[0], ("qpos",)), name_of(MODEL, ("qvel", "qpos", "ctrl"), ENDS[1])}
+    names = {make_name(MODEL, *ENDS), make_name(heavier, *ENDS)}
+    names |= {make_name(MODEL, ENDS[0], ("qpos",)), make_name(MODEL, ("qvel", "qpos", "ctrl"), ENDS[1])}
     with jax.enable_x64(True):
-        names.add(name_of(MODEL, *ENDS))
+        names.add(make_name(MODEL, *ENDS))
     monkeypatch.setattr("importlib.metadata.version", lambda name: "0")
-    name_of.__globals__["_makers"].cache_clear()
-    names.add(name_of(MODEL, *ENDS))
-    name_of.__globals__["_makers"].cache_clear()
+    make_name.__globals__["_list_versions"].cache_clear()
+    names.add(make_name(MODEL, *ENDS))
+    make_name.__globals__["_list_versions"].cache_clear()
     assert len(names) == 6
 
 
@@ -125,23 +125,23 @@ print("mujoco.mjx" in sys.modules)
 
 @pytest.mark.parametrize("damage", [lambda text: text[:-9], lambda text: text.replace(b"8", b"9", 1), lambda text: b""])
 def test_a_damaged_file_is_made_anew(folder, made, damage):
-    with kept_in(texts.find("physics")):
-        program = step.scalar_program(MODEL, *ENDS)
+    with use_store(texts.find("physics")):
+        program = step.make_scalar_program(MODEL, *ENDS)
         (path,) = folder.iterdir()
         path.write_bytes(damage(path.read_bytes()))
-        assert to_text(step.scalar_program(MODEL, *ENDS)) == to_text(program)
+        assert to_text(step.make_scalar_program(MODEL, *ENDS)) == to_text(program)
         assert len(made) == 2
-        step.scalar_program(MODEL, *ENDS)
+        step.make_scalar_program(MODEL, *ENDS)
     assert len(made) == 2
     assert len(list(folder.iterdir())) == 1
 
 
 def test_a_folder_of_others_is_not_read(folder, made):
     with physics_cache(True):
-        step.scalar_program(MODEL, *ENDS)
+        step.make_scalar_program(MODEL, *ENDS)
     folder.chmod(0o777)
     with physics_cache(True):
-        step.scalar_program(MODEL, *ENDS)
+        step.make_scalar_program(MODEL, *ENDS)
     assert len(made) == 2
 
 
@@ -149,7 +149,7 @@ def test_no_folder_is_no_mistake(monkeypatch, tmp_path, made):
     (tmp_path / "file").write_text("")
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "file"))
     with physics_cache(True):
-        step.scalar_program(MODEL, *ENDS)
+        step.make_scalar_program(MODEL, *ENDS)
     assert len(made) == 1
 
 

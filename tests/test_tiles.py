@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from envs.physics import compile_step, stages, tiles
-from envs.physics.stages import as_kernel
+from envs.physics.stages import make_kernel
 from envs.physics.tiles import LANES, TILE, mujoco_step
 
 MODEL = models.make("double pendulum")
@@ -151,7 +151,7 @@ def test_several_kernels(plain, monkeypatch):
 )
 def test_kernels_of_several_parameters(function):
     x, y = np.linspace(0, 1, 1024, dtype=np.float32), np.random.default_rng(0).random((1024, 7), np.float32)
-    repeated = jax.jit(lambda x, y: jax.lax.scan(lambda x, _: (as_kernel(function)(x, y)[0], None), x, length=3)[0])
+    repeated = jax.jit(lambda x, y: jax.lax.scan(lambda x, _: (make_kernel(function)(x, y)[0], None), x, length=3)[0])
     true = x
     for _ in range(3):
         true = function(true, y)[0]
@@ -164,7 +164,7 @@ def test_a_kernel_uses_all_that_it_is_given():
     The marked call's operands come out of a barrier, and all that it does is to hand them on to a call inside it.
     """
     x, y = jnp.ones(4), jnp.ones((4, 3))
-    text = jax.jit(as_kernel(lambda x, y: (jnp.sin(x) * y[:, 0],))).lower(x, y).as_text()
+    text = jax.jit(make_kernel(lambda x, y: (jnp.sin(x) * y[:, 0],))).lower(x, y).as_text()
     outer, inner = (
         match.groups() for match in re.finditer(r"call @(\S+?)\(([^)]*)\) .*xla_cpu_small_call = \"true\"", text)
     )

@@ -1,4 +1,4 @@
-"""What moves the environments: one step of a MuJoCo model as a function of the few arrays that change."""
+"""Physics of the environments: one step of a MuJoCo model, as a function of the few arrays that change."""
 
 from envs.physics.check import check_model, check_once, load_model
 from envs.physics.interpreter import scalarize

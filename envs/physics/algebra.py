@@ -1,10 +1,10 @@
-"""Sums, products, quotients and powers of scalar expressions, simplified as those of real numbers.
+"""Sums, products, quotients and powers of scalar expressions, simplified by the rules for real numbers.
 
 x + 0, x 1, x 0, x - x, x / x, c (d x), a x + b x, signs pulled outwards, sin^2 + cos^2, ...
 
-The simplifications differ from floating point in rounding, in the sign of zero, and where an operand is infinite or
-NaN, or both of a fraction are 0: 0 x is 0 here and NaN there. A NaN that matters still comes out, because what does not
-vanish as a real function is still computed from it.
+The simplifications differ from floating point in rounding, in the sign of zero, and if an operand is infinite or NaN,
+or a fraction is 0 / 0: 0 x is 0 here, and can be NaN in floating point. A NaN that matters still shows in the result,
+since every term that does not vanish for real numbers is still computed.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ def split_coefficient(x: Expression) -> tuple[float, Expression]: ...
 @overload
 def split_coefficient(x: Scalar) -> tuple[float, Scalar]: ...
 def split_coefficient(x: Scalar) -> tuple[float, Scalar]:
-    """(c, y) with x = c y, c a constant and y without one."""
+    """(c, y) with x = c y, where c is a constant and y has no constant factor."""
     if is_operation(x, "neg"):
         c, y = split_coefficient(x.args[0])
         return -c, y
@@ -37,7 +37,7 @@ def split_constant(x: Expression) -> tuple[float, Expression]: ...
 @overload
 def split_constant(x: Scalar) -> tuple[float, Scalar]: ...
 def split_constant(x: Scalar) -> tuple[float, Scalar]:
-    """(c, y) with x = c + y, c a constant and y without one."""
+    """(c, y) with x = c + y, where c is a constant and y has no constant term."""
     if is_operation(x, "add") and is_constant(x.args[0]):
         return x.args
     if is_operation(x, "sub") and is_constant(x.args[0]):
@@ -66,7 +66,7 @@ def neg(x: Scalar) -> Scalar:
 
 
 def add(x: Scalar, y: Scalar) -> Scalar:
-    """x + y, as a difference where one of them is negative; constants are collected, common factors taken out."""
+    """x + y, as a difference if one is negative; collects constants and factors out common factors."""
     if is_constant(x):
         return _shift(x, y)
     if is_constant(y):
@@ -100,7 +100,7 @@ def sub(x: Scalar, y: Scalar) -> Scalar:
 
 
 def _shift(c: float, y: Scalar) -> Scalar:
-    """c + y of a constant c."""
+    """c + y for a constant c."""
     if is_constant(y):
         return c + y
     b, v = split_constant(y)
@@ -111,7 +111,7 @@ def _shift(c: float, y: Scalar) -> Scalar:
 
 
 def _common_factor(x: Expression, y: Expression, sign: int) -> Scalar | None:
-    """x + sign y with one multiplication less, or None: a z + b z = (a + b) z, c u + c v = c (u + v)."""
+    """x + sign y with one multiplication fewer, or None: a z + b z = (a + b) z, c u + c v = c (u + v)."""
     (a, u), (b, v) = split_coefficient(x), split_coefficient(y)
     b = sign * b
     if u is v:
@@ -131,7 +131,7 @@ def _common_factor(x: Expression, y: Expression, sign: int) -> Scalar | None:
 
 
 def mul(x: Scalar, y: Scalar) -> Scalar:
-    """x y, with the sign and the constant factor outermost; products of sines and cosines of one angle are linear."""
+    """x y, with sign and constant factor outermost; linearizes products of sines and cosines of one angle."""
     if is_constant(x):
         return x * y if is_constant(y) else _scale(x, y)
     if is_constant(y):
@@ -142,7 +142,7 @@ def mul(x: Scalar, y: Scalar) -> Scalar:
 
 
 def _scale(c: float, y: Expression) -> Scalar:
-    """c y of a constant c."""
+    """c y for a constant c."""
     b, v = split_coefficient(y)
     c = c * b
     if is_close(abs(c), 1, y.dtype):
@@ -160,7 +160,7 @@ def _scale(c: float, y: Expression) -> Scalar:
 
 
 def div(x: Scalar, y: Scalar) -> Scalar:
-    """x / y; by a constant it is a product."""
+    """x / y; a product if y is a constant."""
     if not (_is_floating(x) or _is_floating(y)):
         return build("div", x, y)
     if is_constant(y):
@@ -243,7 +243,7 @@ def _angle_sum(u: Expression, v: Expression, sign: int) -> Scalar | None:
 
 
 def _sines_and_cosines(x: Expression):
-    """((kind, angle), (kind, angle)) of a product of two sines or cosines, else None."""
+    """((kind, angle), (kind, angle)) for a product of two sines or cosines, else None."""
     if x.op != "mul" or not all(is_operation(arg, "sin") or is_operation(arg, "cos") for arg in x.args):
         return None
     return tuple((arg.op, arg.args[0]) for arg in x.args)

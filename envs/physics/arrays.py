@@ -1,7 +1,7 @@
 """Arrays of scalar expressions.
 
-An array is either numeric (all its elements are known) or of dtype object, with an `Expression` or a Python number in
-every place. Moving elements about is the same for both.
+An array is either numeric, if all its elements are known, or of dtype object, with an `Expression` or a Python number
+for each element. Both move elements in the same way.
 """
 
 from __future__ import annotations
@@ -22,12 +22,12 @@ def is_numeric(*arrays: Array) -> bool:
 
 
 def as_objects(x: Array) -> Array:
-    """The same elements as Python numbers and expressions."""
+    """The array with dtype object, whose elements are Python numbers and expressions."""
     return x if x.dtype == object else x.astype(object)
 
 
 def promote(*arrays: Array) -> tuple[Array, ...]:
-    """The arrays as they are if all are numeric; else all of dtype object, so that elements can go from one to another.
+    """The arrays unchanged if all are numeric; else all with dtype object, so that they can exchange elements.
 
     >>> [x.dtype.kind for x in promote(np.ones(2), np.ones(2, object))]
     ['O', 'O']
@@ -36,13 +36,13 @@ def promote(*arrays: Array) -> tuple[Array, ...]:
 
 
 def pack(elements: list, shape: tuple[int, ...]) -> Array:
-    """An object array from its elements in order."""
+    """An object array from its elements, in order."""
     array = np.empty(len(elements), object)
     array[:] = elements
     return array.reshape(shape)
 
 
 def choose_array(index: Expression, cases: Sequence[Array], aval) -> Array:
-    """cases[index], the index clamped into the range."""
+    """cases[index], with the index clamped to the valid range."""
     options = zip(*(as_objects(case).flat for case in cases), strict=True)
     return pack([choose(index, *option, dtype=np.dtype(aval.dtype)) for option in options], aval.shape)

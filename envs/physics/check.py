@@ -1,4 +1,4 @@
-"""Whether MJX simulates a model as C MuJoCo does."""
+"""Checks whether MJX simulates a model as C MuJoCo does."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from envs.physics.callback import COUNTED, has_diverged
+from envs.physics.callback import INITIAL_COUNT, has_diverged
 from envs.physics.models import compile_model, ignored_features, load_spec, model_digest, model_name
 from envs.physics.step import compile_step
 
@@ -34,7 +34,7 @@ def load_model(path: str | Path) -> mujoco.MjModel:
 
 
 def check_once(model: mujoco.MjModel) -> None:
-    """Logs what `check_model` finds, one warning each, when a model is met for the first time in this process."""
+    """Logs the problems from `check_model` as warnings, once for each model in this process."""
     digest = model_digest(model)
     if digest not in _checked:
         _checked.add(digest)
@@ -43,16 +43,16 @@ def check_once(model: mujoco.MjModel) -> None:
 
 
 def check_model(model: mujoco.MjModel, num_steps: int = 50, tolerance: float = 1e-3) -> list[str]:
-    """What is wrong with stepping a model by MJX, one line each; empty if nothing was found.
+    """Problems of stepping a model by MJX, one line each; empty if there are none.
 
-    Names the features that MJX leaves out without a word, then takes `num_steps` steps by `compile_step` and by C
+    Lists the features that MJX silently ignores, then takes `num_steps` steps by `compile_step` and by C
     MuJoCo from the initial state under the same random controls, and compares positions and velocities.
 
     Args:
       model: a compiled model.
-      num_steps: steps to compare. Long comparisons end in rounding: with contacts after some ten steps, in chaotic
-        motion after some hundred.
-      tolerance: difference allowed, relative to the largest position or velocity (at least 1).
+      num_steps: steps to compare. Rounding limits the comparison, with contacts to some ten steps and in chaotic motion
+        to some hundred.
+      tolerance: allowed difference, relative to the largest position or velocity (at least 1).
 
     Raises:
       MujocoModelError: MJX cannot step the model.
@@ -63,7 +63,7 @@ def check_model(model: mujoco.MjModel, num_steps: int = 50, tolerance: float = 1
     state = ("qpos", "qvel", "act", "qacc_warmstart") if model.na else ("qpos", "qvel", "qacc_warmstart")
     step = jax.jit(compile_step(model, inputs=(*state, "ctrl"), outputs=state))
     data = mujoco.MjData(model)
-    data.warning.number[:] = COUNTED
+    data.warning.number[:] = INITIAL_COUNT
     random = np.random.default_rng(0)
     limit = np.where(model.actuator_ctrllimited, model.actuator_ctrlrange[:, 1], 1.0)
     ours = [jnp.asarray(getattr(data, name)) for name in state]

@@ -1,8 +1,8 @@
-"""Scalar expressions: what a number is while a program is being turned into scalar equations.
+"""Scalar expressions, which stand for numbers while a program is turned into scalar equations.
 
-An `Expression` is one scalar operation on other expressions and on constants (Python numbers). A `Graph` has each of
-them once: the same operation on the same operands is the expression that is there already. Here an expression is taken
-as it is written; `envs.physics.primitives.apply` simplifies it first.
+An `Expression` is one scalar operation on other expressions and on constants (Python numbers). A `Graph` holds each
+expression once: the same operation on the same operands returns the existing expression. Nothing is simplified here;
+`envs.physics.primitives.apply` does that.
 """
 
 from __future__ import annotations
@@ -25,11 +25,11 @@ class Expression:
     """One scalar operation of a `Graph`.
 
     Attributes:
-      op: the name of a jax primitive, or "input".
-      args: its operands.
-      params: the primitive's parameters as a hashable tuple of pairs.
-      dtype: of the result.
-      index: the number of the expression in its graph; operands have smaller numbers.
+      op: name of a jax primitive, or "input".
+      args: operands.
+      params: parameters of the primitive, as a hashable tuple of pairs.
+      dtype: dtype of the result.
+      index: number of the expression in its graph; operands have smaller numbers.
     """
 
     __slots__ = ("args", "dtype", "graph", "index", "op", "params")
@@ -44,7 +44,7 @@ class Expression:
 
 
 class Graph:
-    """The expressions of one program, each of them once."""
+    """The expressions of one program, without duplicates."""
 
     def __init__(self):
         self.size = 0
@@ -55,7 +55,7 @@ class Graph:
         return Expression(self, "input", (), (), np.dtype(dtype))
 
     def expression(self, op: str, args: tuple, params: tuple, dtype: np.dtype) -> Expression:
-        """The expression as written, without simplification."""
+        """The expression, without simplification."""
         if op in COMMUTATIVE and _order(args[0]) > _order(args[1]):
             args = (args[1], args[0])
         key = (op, tuple(map(identity, args)), params, dtype)
@@ -66,20 +66,20 @@ class Graph:
 
 
 def build(op: str, *args: Scalar, dtype: np.dtype | None = None, params: tuple = ()) -> Expression:
-    """The expression as written, in the graph of its operands; of the first one's dtype where none is given."""
-    some = next(arg for arg in args if isinstance(arg, Expression))
-    return some.graph.expression(op, args, params, some.dtype if dtype is None else dtype)
+    """The unsimplified expression, in the graph of its operands; by default with the first one's dtype."""
+    operand = next(arg for arg in args if isinstance(arg, Expression))
+    return operand.graph.expression(op, args, params, operand.dtype if dtype is None else dtype)
 
 
 def identity(x: Scalar):
-    """What tells two operands apart: 0.0 and -0.0, and 1, 1.0 and True, are different constants."""
+    """A key that identifies an operand; 0.0 and -0.0, and 1, 1.0 and True, are different constants."""
     if isinstance(x, Expression):
         return x.index
     return type(x), x, math.copysign(1.0, x)
 
 
 def _order(x: Scalar) -> int:
-    """Constants first, then in the order of making."""
+    """Sort key: constants first, then expressions in order of creation."""
     return x.index if isinstance(x, Expression) else -1
 
 

@@ -1,4 +1,4 @@
-"""Constant folding: what jax's elementwise primitives are of numbers alone."""
+"""Constant folding: jax's elementwise primitives on numbers."""
 
 from __future__ import annotations
 
@@ -7,13 +7,13 @@ from typing import Any
 
 import numpy as np
 
-# Constants are taken as equal, as 0 or as 1 if they differ by so many units in the last place of what they were made
-# of: what the rounding of 1 / sqrt(2) in a quaternion leaves behind would else keep terms alive that are not there.
+# Constants count as equal, as 0 or as 1 if they differ by at most this many units in the last place of their terms.
+# Otherwise the rounding of 1 / sqrt(2) in a quaternion, for example, would leave terms that are really 0.
 ROUNDING = 4
 
 
 def fold(op: str, *args: Any, dtype: np.dtype, params: tuple = ()) -> Any:
-    """The value of a primitive on numpy arrays or Python numbers; of the latter a Python number."""
+    """The value of a primitive on numpy arrays or Python numbers; a Python number if all operands are."""
     with np.errstate(all="ignore"):
         value = np.asarray(NUMPY[op](*args, **dict(params)), dtype=dtype)
     if op in ("add", "sub") and dtype.kind == "f":
@@ -22,18 +22,18 @@ def fold(op: str, *args: Any, dtype: np.dtype, params: tuple = ()) -> Any:
 
 
 def snap(result: np.ndarray, size: np.ndarray) -> np.ndarray:
-    """Sums of constants, exactly 0 where they differ from 0 by the rounding of terms of that size only."""
+    """Sets sums of constants to exactly 0 if they are within the rounding of terms of this size."""
     return np.where(np.abs(result) < ROUNDING * np.finfo(result.dtype).eps * size, 0, result).astype(result.dtype)
 
 
 def add_constants(a: float, b: float, dtype: np.dtype) -> float:
-    """a + b of constants beside an expression of this dtype, 0 where it is that but for rounding."""
+    """a + b for constants next to an expression of this dtype; 0 if it is 0 up to rounding."""
     result = a + b
     return 0 * result if is_close(a, -b, dtype) else result
 
 
 def is_close(a: float, b: float, dtype: np.dtype) -> bool:
-    """Whether two constants beside an expression of this dtype are equal but for rounding."""
+    """Whether two constants next to an expression of this dtype are equal up to rounding."""
     if dtype.kind != "f":
         return a == b
     return abs(a - b) <= ROUNDING * float(np.finfo(dtype).eps) * max(abs(a), abs(b))

@@ -1,10 +1,10 @@
-"""A function of small arrays turned into the same function as scalar equations.
+"""Turns a function of small arrays into scalar equations.
 
 `scalarize(fn, *example_args)` traces `fn` to a jaxpr and interprets it once, with every array replaced by its
 elements: a number where the element is known, an `Expression` where it depends on the arguments. Slicing, gathering,
 padding and stacking then cost nothing, products with 0 vanish, small dot products, factorisations and fixed-length
-loops are written out, and what is used by nobody is dropped. What is left is handed to XLA as scalar operations,
-which under `vmap` are operations on contiguous vectors of the batch.
+loops are written out, and unused results are dropped. XLA gets the rest as scalar operations, which under `vmap` are
+operations on contiguous vectors of the batch.
 """
 
 from __future__ import annotations
@@ -20,23 +20,23 @@ from envs.physics.arrays import as_objects, choose_array, is_numeric, pack, prom
 from envs.physics.expressions import Expression, Graph
 from envs.physics.primitives import UnsupportedPrimitiveError
 from envs.physics.rules import RULES
-from envs.physics.stages import Stage, in_kernels, in_order, make_stages, run, separately
+from envs.physics.stages import Stage, compile_separately, join_into_kernels, make_stages, run, sort_equations
 
 
 def scalarize(fn: Callable, *example_args: Any) -> Callable:
-    """The same function, as scalar equations.
+    """Turns a function into the same function as scalar equations.
 
     Args:
       fn: a pure function of pytrees of arrays that jax can trace.
-      example_args: arguments (arrays or `jax.ShapeDtypeStruct`s) with the shapes and dtypes that the function will get.
+      example_args: arguments (arrays or `jax.ShapeDtypeStruct`s) with the shapes and dtypes of later arguments.
 
     Returns:
-      A function of the same arguments with the same result, up to rounding, that can be jitted, batched and
+      A function of the same arguments with the same result up to rounding, which can be jitted, batched and
       differentiated. Its attribute `program` is the `Program`.
 
     Raises:
-      UnsupportedPrimitiveError: `fn` uses something that has no scalar form (a loop whose length depends on the
-        data, an index that does); the message names the primitive.
+      UnsupportedPrimitiveError: `fn` has no scalar form, for example because the length of a loop or an index depends
+        on the data; the message names the primitive.
     """
     program = trace(fn, *example_args)
 
@@ -52,23 +52,22 @@ def scalarize(fn: Callable, *example_args: Any) -> Callable:
 
 
 class Program:
-    """Scalar equations with named ends: what `trace` makes of a function.
+    """The scalar equations of a function, with its inputs and outputs; made by `trace`.
 
-    The three steps of a call are apart, so that a loop over the program can carry the elements and leave the arrays
-    outside.
+    A call consists of `split`, `run` and `join`, so that a loop can call `run` alone and carry only the elements.
 
     Attributes:
-      inputs: one array of input expressions for each leaf of the arguments.
-      outputs: one array of expressions and constants for each leaf of the result.
-      input_structure, output_structure: the pytrees of both.
+      inputs: an array of input expressions for each leaf of the arguments.
+      outputs: an array of expressions and constants for each leaf of the result.
+      input_structure, output_structure: their pytree structures.
     """
 
     def __init__(self, inputs, outputs, output_dtypes, input_structure, output_structure):
         self.inputs, self.outputs, self.output_dtypes = inputs, outputs, output_dtypes
         self.input_structure, self.output_structure = input_structure, output_structure
         self._results = [x for array in outputs for x in as_objects(array).flat]
-        self.stages = make_stages(self._computed())
-        self._split = separately(_elements)
+        self.stages = make_stages(self._output_expressions())
+        self._split = compile_separately(_list_elements)
 
     @property
     def results(self) -> list[jax.ShapeDtypeStruct]:
@@ -84,13 +83,13 @@ class Program:
 
     def equations(self) -> list[Expression]:
         """The scalar equations, operands first."""
-        return in_order(self._computed())
+        return sort_equations(self._output_expressions())
 
     def kernels(self) -> list[Stage]:
-        """The stages in a few large pieces, each of them one kernel on a CPU."""
-        return in_kernels(self.stages, self._computed())
+        """The stages joined into a few large ones, each of them one kernel on a CPU."""
+        return join_into_kernels(self.stages, self._output_expressions())
 
-    def _computed(self) -> list[Expression]:
+    def _output_expressions(self) -> list[Expression]:
         return [x for x in self._results if isinstance(x, Expression)]
 
     def split(self, leaves: Sequence) -> list[jax.Array]:
@@ -98,7 +97,7 @@ class Program:
         return self._split(*leaves)
 
     def run(self, elements: list[jax.Array], stages: list[Stage] | None = None) -> list[jax.Array]:
-        """The elements of the result's leaves; by other stages than the program's own if they are given."""
+        """The elements of the result's leaves, computed by the program's stages or by those given."""
         values = dict(zip((x.index for array in self.inputs for x in array.flat), elements, strict=True))
         run(self.stages if stages is None else stages, values)
         dtypes = (dtype for array, dtype in zip(self.outputs, self.output_dtypes, strict=True) for _ in array.flat)
@@ -111,18 +110,18 @@ class Program:
         """The result's leaves from their elements."""
         leaves, begin = [], 0
         for array, dtype in zip(self.outputs, self.output_dtypes, strict=True):
-            mine = elements[begin : begin + array.size]
+            part = elements[begin : begin + array.size]
             begin += array.size
-            leaves.append(jnp.stack(mine).reshape(array.shape) if mine else jnp.zeros(array.shape, dtype))
+            leaves.append(jnp.stack(part).reshape(array.shape) if part else jnp.zeros(array.shape, dtype))
         return leaves
 
 
-def _elements(*leaves):
+def _list_elements(*leaves):
     return [leaf[place] for leaf in leaves for place in np.ndindex(*leaf.shape)]
 
 
 def trace(fn: Callable, *example_args: Any) -> Program:
-    """The scalar equations of a function."""
+    """Traces a function to its scalar equations."""
     closed, shape = jax.make_jaxpr(fn, return_shape=True)(*example_args)
     graph = Graph()
     inputs = [_input_array(graph, aval) for aval in closed.in_avals]
@@ -141,27 +140,27 @@ def _input_array(graph: Graph, aval) -> np.ndarray:
 
 
 def evaluate(jaxpr, consts, args, wanted: list[bool] | None = None) -> list:
-    """The jaxpr's results, with `None` for those that are not wanted; only what they need is interpreted."""
+    """The results of a jaxpr, with None for those that are not wanted; interprets only the equations they need."""
     outvars = [var for i, var in enumerate(jaxpr.outvars) if wanted is None or wanted[i]]
     values = dict(zip(jaxpr.constvars, map(np.asarray, consts), strict=True))
     values.update(zip(jaxpr.invars, args, strict=True))
-    for equation, wanted_here in _needed(jaxpr, outvars):
+    for equation, wanted_here in _find_needed(jaxpr, outvars):
         operands = [_read(values, var) for var in equation.invars]
         results = interpret(equation, operands, wanted_here)
         values.update((var, value) for var, value in zip(equation.outvars, results, strict=True) if value is not None)
     return [_read(values, var) if wanted is None or wanted[i] else None for i, var in enumerate(jaxpr.outvars)]
 
 
-def _needed(jaxpr, outvars) -> list:
-    """The equations that the variables depend on, each with which of its results are used."""
+def _find_needed(jaxpr, outvars) -> list:
+    """The equations that the variables depend on, and for each the results that are used."""
     used = {var for var in outvars if not _is_literal(var)}
-    kept = []
+    needed = []
     for equation in reversed(jaxpr.eqns):
         wanted = [var in used for var in equation.outvars]
         if any(wanted):
-            kept.append((equation, wanted))
+            needed.append((equation, wanted))
             used.update(var for var in equation.invars if not _is_literal(var))
-    return kept[::-1]
+    return needed[::-1]
 
 
 def _is_literal(var) -> bool:
@@ -181,18 +180,18 @@ def interpret(equation, operands: list, wanted: list[bool]) -> list:
         raise UnsupportedPrimitiveError(f"{name}: no scalar rule")
     results = RULES[name](equation.outvars[0].aval, *operands, **params)
     results = results if isinstance(results, tuple) else (results,)
-    return [_settle(result, var.aval.dtype) for result, var in zip(results, equation.outvars, strict=True)]
+    return [_simplify_dtype(result, var.aval.dtype) for result, var in zip(results, equation.outvars, strict=True)]
 
 
-def _settle(array: np.ndarray, dtype) -> np.ndarray:
-    """A numeric array where nothing in it depends on the data any more."""
+def _simplify_dtype(array: np.ndarray, dtype) -> np.ndarray:
+    """The array, numeric if no element depends on the data."""
     array = np.asarray(array)
     if array.dtype == object and not any(isinstance(x, Expression) for x in array.flat):
         return array.astype(dtype)
     return array
 
 
-# --- primitives that hold programs ------------------------------------------------------------------------------------
+# --- primitives that contain programs ---------------------------------------------------------------------------------
 
 
 def _call(operands, wanted, *, jaxpr=None, call_jaxpr=None, **_):
@@ -202,7 +201,7 @@ def _call(operands, wanted, *, jaxpr=None, call_jaxpr=None, **_):
 
 
 def _call_high(operands, wanted, *, _prim):
-    """A primitive that jax (from 0.12) keeps whole in its jaxprs and that knows its own definition."""
+    """A primitive that jax, from 0.12 on, does not expand in its jaxprs, and that can expand itself."""
     structure, avals = _prim.in_tree, _prim.in_avals_flat
     closed = jax.make_jaxpr(lambda *leaves: jax.tree.leaves(_prim.expand(*structure.unflatten(leaves))))(*avals)
     return evaluate(closed.jaxpr, closed.consts, operands, wanted)
@@ -224,14 +223,14 @@ def _scan(operands, wanted, *, jaxpr, length, reverse, **groups):
 
 
 def _scan_operands(operands, *, num_consts=0, num_carry=0, ft_in=None, **_):
-    """(consts, carry, xs): by their numbers, or from jax 0.12 on by a tree that has them as its branches."""
+    """(consts, carry, xs), split by their numbers, or from jax 0.12 on by a tree."""
     if ft_in is not None:
         return map(list, ft_in.update(operands).unpack())
     return operands[:num_consts], operands[num_consts : num_consts + num_carry], operands[num_consts + num_carry :]
 
 
 def _cond(operands, wanted, *, branches, **_):
-    """The branch that is taken; if that depends on the data, a select among all of them, as under `vmap`."""
+    """The branch taken; if that depends on the data, all branches and a select, as under `vmap`."""
     which, *operands = operands
     if is_numeric(which):
         branch = branches[int(np.clip(int(which), 0, len(branches) - 1))]
@@ -244,14 +243,14 @@ def _cond(operands, wanted, *, branches, **_):
 
 
 def _while(operands, wanted, *, cond_nconsts, cond_jaxpr, body_nconsts, body_jaxpr):
-    """A loop whose number of rounds is known; one that depends on the data has no scalar form."""
+    """A loop with a known number of iterations; if it depends on the data there is no scalar form."""
     cond_consts, body_consts = operands[:cond_nconsts], operands[cond_nconsts : cond_nconsts + body_nconsts]
     carry = operands[cond_nconsts + body_nconsts :]
     while True:
-        (go_on,) = evaluate(cond_jaxpr.jaxpr, cond_jaxpr.consts, [*cond_consts, *carry])
-        if not is_numeric(go_on):
-            raise UnsupportedPrimitiveError("while: the number of rounds depends on the data")
-        if not go_on:
+        (continues,) = evaluate(cond_jaxpr.jaxpr, cond_jaxpr.consts, [*cond_consts, *carry])
+        if not is_numeric(continues):
+            raise UnsupportedPrimitiveError("while: the number of iterations depends on the data")
+        if not continues:
             return carry
         carry = evaluate(body_jaxpr.jaxpr, body_jaxpr.consts, [*body_consts, *carry])
 

@@ -1,4 +1,4 @@
-"""MuJoCo models: read, compiled, and checked against what MJX makes of them."""
+"""Reads and compiles MuJoCo models, and finds their features that MJX ignores."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     import mujoco
 
 
-# Fields of mjModel that MJX 3.17 never reads: what they ask for is not simulated when one of them is not 0.
+# Fields of mjModel that MJX 3.17 never reads: the feature is not simulated, although one of its values is not 0.
 IGNORED_FIELDS = {
     "geom_surfacevel": "surface velocity of geoms",
     "geom_adhesion": "adhesion of geoms",
@@ -32,7 +32,7 @@ IGNORED_FIELDS = {
     "sensor_delay": "delay of sensors",
     "sensor_interval": "sampling interval of sensors",
 }
-# Sensors of forces and accelerations: MJX leaves them at 0 in a model that has no constraint.
+# Sensors of forces and accelerations, which MJX leaves at 0 in a model without constraints.
 ACCELERATION_SENSORS = ("ACCELEROMETER", "FORCE", "TORQUE", "FRAMELINACC", "FRAMEANGACC")
 
 
@@ -44,7 +44,7 @@ def load_spec(path: str | Path) -> mujoco.MjSpec:
     """The editable specification in an MJCF file.
 
     Raises:
-      MujocoModelError: the file is missing or is not MJCF; MuJoCo's own message, which has the line, after the path.
+      MujocoModelError: the file is missing or is not MJCF; the message has the path and MuJoCo's message with the line.
     """
     mujoco = import_mujoco()
     try:
@@ -54,19 +54,19 @@ def load_spec(path: str | Path) -> mujoco.MjSpec:
 
 
 def import_mujoco():
-    """`mujoco`; raises MujocoModelError where its import fails, as it does with a MUJOCO_GL that is not to be had."""
+    """Imports `mujoco`; raises MujocoModelError if that fails because of the value of MUJOCO_GL."""
     try:
         import mujoco
-    except (ImportError, RuntimeError, AttributeError) as error:  # the last where a library of OpenGL is missing
-        given = os.environ.get("MUJOCO_GL")
-        if given is None:
+    except (ImportError, RuntimeError, AttributeError) as error:  # the last if an OpenGL library is missing
+        value = os.environ.get("MUJOCO_GL")
+        if value is None:
             raise
-        raise MujocoModelError(f"MUJOCO_GL={given}: MuJoCo cannot be imported with it ({error}); unset it") from error
+        raise MujocoModelError(f"MUJOCO_GL={value}: MuJoCo cannot be imported with it ({error}); unset it") from error
     return mujoco
 
 
 def compile_model(spec: mujoco.MjSpec) -> mujoco.MjModel:
-    """The compiled model of a specification; raises MujocoModelError with MuJoCo's message where it has none."""
+    """Compiles a specification; raises MujocoModelError with MuJoCo's message if it cannot be compiled."""
     try:
         return spec.compile()
     except ValueError as error:
@@ -74,12 +74,12 @@ def compile_model(spec: mujoco.MjSpec) -> mujoco.MjModel:
 
 
 def model_name(model: mujoco.MjModel) -> str:
-    """The name in the MJCF: the first of MuJoCo's zero-terminated names."""
+    """The name in the MJCF, which is the first of MuJoCo's zero-terminated names."""
     return model.names.split(b"\0", 1)[0].decode() or "MuJoCo model"
 
 
 def model_digest(model: mujoco.MjModel) -> bytes:
-    """A digest of all that a compiled model holds."""
+    """A digest of the whole content of a compiled model."""
     import mujoco
 
     content = np.empty(mujoco.mj_sizeModel(model), np.uint8)
@@ -88,7 +88,7 @@ def model_digest(model: mujoco.MjModel) -> bytes:
 
 
 def put_model(model: mujoco.MjModel):
-    """MJX's model; raises MujocoModelError with the name of what MJX does not support."""
+    """The MJX model; raises MujocoModelError with the name of the feature that MJX does not support."""
     import mujoco
 
     if not model.nmat and mujoco.mjtSensor.mjSENS_RANGEFINDER in model.sensor_type:
@@ -103,9 +103,9 @@ def put_model(model: mujoco.MjModel):
 
 
 def import_mjx():
-    """`mujoco.mjx`, imported where it is first needed and without its two printed lines about Warp.
+    """Imports `mujoco.mjx`, without the two lines that it prints about Warp, its optional GPU backend.
 
-    The import takes seconds, which nobody should pay who only asks for `--help`; Warp is its optional GPU backend.
+    The import takes seconds, so it is done only when needed and not for `--help`.
     """
     with contextlib.redirect_stdout(io.StringIO()):
         from mujoco import mjx
@@ -113,21 +113,22 @@ def import_mjx():
 
 
 def ignored_features(model: mujoco.MjModel) -> list[str]:
-    """What a model asks for and MJX leaves out without a word, one phrase each; empty if there is nothing."""
+    """The features of a model that MJX silently ignores, one phrase each; empty if there are none."""
     import mujoco
 
-    found = [meaning for field, meaning in IGNORED_FIELDS.items() if np.any(getattr(model, field, 0))]
+    features = [meaning for field, meaning in IGNORED_FIELDS.items() if np.any(getattr(model, field, 0))]
     if model.opt.noslip_iterations:
-        found.append("noslip iterations of the solver")
+        features.append("noslip iterations of the solver")
     if model.opt.disableactuator:
-        found.append("disabled groups of actuators")
+        features.append("disabled groups of actuators")
     if model.opt.enableflags & mujoco.mjtEnableBit.mjENBL_SLEEP:
-        found.append("sleeping islands")
+        features.append("sleeping islands")
     sensors = {mujoco.mjtSensor(int(kind)).name.removeprefix("mjSENS_") for kind in model.sensor_type}
     sensors &= set(ACCELERATION_SENSORS)
     if sensors and not _has_constraints(model):
-        found.append(f"sensors of accelerations and forces without a constraint ({', '.join(sorted(sensors)).lower()})")
-    return found
+        names = ", ".join(sorted(sensors)).lower()
+        features.append(f"sensors of accelerations and forces without a constraint ({names})")
+    return features
 
 
 def _has_constraints(model: mujoco.MjModel) -> bool:

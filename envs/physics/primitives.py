@@ -1,4 +1,4 @@
-"""Jax's elementwise primitives on scalars, each simplified as far as it can be."""
+"""Jax's elementwise primitives on scalars, simplified as far as possible."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def apply(op: str, *args: Scalar, dtype: np.dtype, params: tuple = ()) -> Scalar
 
 
 def select(which: Scalar, on_false: Scalar, on_true: Scalar, *others: Scalar, dtype: np.dtype | None = None) -> Scalar:
-    """`on_true` where `which` holds, else `on_false`; of more cases the one with the number `which`."""
+    """`on_true` if `which` is true, else `on_false`; with more cases, the one with index `which`."""
     if others:
         return choose(which, on_false, on_true, *others, dtype=dtype)
     if is_constant(which):
@@ -45,11 +45,11 @@ def select(which: Scalar, on_false: Scalar, on_true: Scalar, *others: Scalar, dt
 
 
 def choose(index: Scalar, *cases: Scalar, dtype: np.dtype | None) -> Scalar:
-    """cases[index], the index clamped into the range."""
-    chosen = cases[0]
+    """cases[index], with the index clamped to the valid range."""
+    result = cases[0]
     for at, case in enumerate(cases[1:], start=1):
-        chosen = select(apply("ge", index, at, dtype=np.dtype(bool)), chosen, case, dtype=dtype)
-    return chosen
+        result = select(apply("ge", index, at, dtype=np.dtype(bool)), result, case, dtype=dtype)
+    return result
 
 
 def maximum(x: Scalar, y: Scalar) -> Scalar:
@@ -72,7 +72,7 @@ def clamp(low: Scalar, x: Scalar, high: Scalar) -> Scalar:
 
 
 def logical_and(x: Scalar, y: Scalar) -> Scalar:
-    """x and y, of truth values or bit by bit; x and x = x."""
+    """x and y, logical or bitwise; x and x = x."""
     if is_constant(x):
         x, y = y, x
     if x is y or y is True:
@@ -81,7 +81,7 @@ def logical_and(x: Scalar, y: Scalar) -> Scalar:
 
 
 def logical_or(x: Scalar, y: Scalar) -> Scalar:
-    """x or y, of truth values or bit by bit; x or x = x."""
+    """x or y, logical or bitwise; x or x = x."""
     if is_constant(x):
         x, y = y, x
     if x is y or y is False:
@@ -90,12 +90,12 @@ def logical_or(x: Scalar, y: Scalar) -> Scalar:
 
 
 def logical_not(x: Expression) -> Scalar:
-    """not x, of a truth value or bit by bit; not not x = x."""
+    """not x, logical or bitwise; not not x = x."""
     return x.args[0] if x.op == "not" else build("not", x)
 
 
 def convert(x: Expression, new_dtype: np.dtype) -> Scalar:
-    """x in another dtype; nothing happens where it has that one."""
+    """x converted to another dtype; unchanged if it has this dtype."""
     if x.dtype == new_dtype:
         return x
     dtype = np.dtype(new_dtype)

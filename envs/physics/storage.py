@@ -1,8 +1,7 @@
-"""Programs of scalar equations as text, kept between processes.
+"""Stores programs of scalar equations as text, for later processes.
 
-Making a program of a model takes a second or more, most of it MJX's: its import, and the tracing of its step. Reading
-one takes milliseconds, and what is read is what was written, expression for expression. Without `kept_in` every program
-is made anew.
+Making the program of a model takes a second or more, mostly for importing MJX and tracing its step. Reading one takes
+milliseconds, and gives the same expressions. Without `use_store` every program is made anew.
 """
 
 from __future__ import annotations
@@ -30,21 +29,21 @@ if TYPE_CHECKING:
 
 
 class Store(Protocol):
-    """Texts by name, from one process to the next."""
+    """Texts by name, which persist between processes."""
 
     def read(self, name: str) -> str | None:
-        """The text, as it was written; None where there is none."""
+        """The text as it was written; None if there is none."""
 
     def write(self, name: str, text: str) -> None:
-        """Keeps the text, if that is possible."""
+        """Stores the text, if possible."""
 
 
 _store: Store | None = None
 
 
 @contextlib.contextmanager
-def kept_in(store: Store | None) -> Iterator[None]:
-    """Programs that are asked for inside come from the store, or are made and written there."""
+def use_store(store: Store | None) -> Iterator[None]:
+    """Inside this context, programs are read from the store, or made and written to it."""
     global _store
     before, _store = _store, store
     try:
@@ -53,8 +52,8 @@ def kept_in(store: Store | None) -> Iterator[None]:
         _store = before
 
 
-def kept(name: str, make: Callable[[], Program]) -> Program:
-    """The program of that name, from the store if there is one that has it."""
+def load_or_make(name: str, make: Callable[[], Program]) -> Program:
+    """The program with this name, from the store if it has it, else from `make`."""
     text = None if _store is None else _store.read(name)
     if text is not None:
         return from_text(text)
@@ -64,24 +63,24 @@ def kept(name: str, make: Callable[[], Program]) -> Program:
     return program
 
 
-def name_of(model: mujoco.MjModel, inputs: tuple[str, ...], outputs: tuple[str, ...]) -> str:
-    """A name for the program of a model's step, other than that of any program that may differ from it."""
+def make_name(model: mujoco.MjModel, inputs: tuple[str, ...], outputs: tuple[str, ...]) -> str:
+    """A name for the program of a model's step; programs that may differ have different names."""
     return hashlib.sha256(
-        model_digest(model) + repr((inputs, outputs, jax.config.values["jax_enable_x64"], *_makers())).encode()
+        model_digest(model) + repr((inputs, outputs, jax.config.values["jax_enable_x64"], *_list_versions())).encode()
     ).hexdigest()
 
 
 @functools.cache
-def _makers() -> tuple[str, ...]:
-    """What makes a program of a model: the packages' versions and the text of this one."""
+def _list_versions() -> tuple[str, ...]:
+    """The versions of the code that makes programs: of the packages, and a digest of this package's source."""
     versions = (importlib.metadata.version(name) for name in ("jax", "mujoco", "mujoco-mjx", "numpy"))
     sources = sorted(Path(__file__).parent.rglob("*.py"))
     return (*versions, hashlib.sha256(b"".join(path.read_bytes() for path in sources)).hexdigest())
 
 
 # --- a program as JSON ------------------------------------------------------------------------------------------------
-# An element is a constant as it is, or [i] for expression i. Expressions have the order in which they were made, which
-# is what the order of a program's equations follows.
+# An element is a constant itself, or [i] for expression i. Expressions are in order of creation, which is also the
+# order of a program's equations.
 
 
 def to_text(program: Program) -> str:
@@ -97,7 +96,9 @@ def to_text(program: Program) -> str:
         return [list(x.shape), [element(part) for part in as_objects(x).flat]]
 
     content = {
-        "expressions": [[x.op, [element(arg) for arg in x.args], _plain(x.params), x.dtype.name] for x in expressions],
+        "expressions": [
+            [x.op, [element(arg) for arg in x.args], _encode_params(x.params), x.dtype.name] for x in expressions
+        ],
         "inputs": [array(x) for x in program.inputs],
         "outputs": [[*array(x), dtype.name] for x, dtype in zip(program.outputs, program.output_dtypes, strict=True)],
     }
@@ -105,7 +106,7 @@ def to_text(program: Program) -> str:
 
 
 def from_text(text: str) -> Program:
-    """The program that `to_text` has written; a function of as many arrays as it has inputs."""
+    """The program in a text of `to_text`, as a function of one array per input."""
     content, graph = json.loads(text), Graph()
     expressions: list[Expression] = []
 
@@ -117,9 +118,9 @@ def from_text(text: str) -> Program:
 
     for op, operands, params, dtype in content["expressions"]:
         if op != "input" and op not in NUMPY:
-            raise ValueError(f"{op} is no operation of scalar equations")
+            raise ValueError(f"{op} is not an operation of scalar equations")
         args = tuple(map(element, operands))
-        expressions.append(Expression(graph, op, args, _parameters(params), np.dtype(dtype)))
+        expressions.append(Expression(graph, op, args, _decode_params(params), np.dtype(dtype)))
     outputs = [array(shape, elements) for shape, elements, _ in content["outputs"]]
     return Program(
         [array(*x) for x in content["inputs"]],
@@ -130,9 +131,9 @@ def from_text(text: str) -> Program:
     )
 
 
-def _plain(params: tuple) -> list:
+def _encode_params(params: tuple) -> list:
     return [[name, {"dtype": value.name} if isinstance(value, np.dtype) else value] for name, value in params]
 
 
-def _parameters(plain: list) -> tuple:
-    return tuple((name, np.dtype(value["dtype"]) if isinstance(value, dict) else value) for name, value in plain)
+def _decode_params(params: list) -> tuple:
+    return tuple((name, np.dtype(value["dtype"]) if isinstance(value, dict) else value) for name, value in params)

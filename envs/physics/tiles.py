@@ -1,12 +1,12 @@
-"""Programs as one jax primitive, whose batch a CPU computes a tile of environments after the other.
+"""Programs as a jax primitive, whose batch a CPU computes in tiles of environments.
 
 Under `vmap` every stored value of a program (`envs.physics.stages`) is a loop over the batch, and XLA's CPU runtime
-calls its loops one by one. Large programs have hundreds: 1,024 environments then spill the caches, their arrays begin
-at equal places of memory pages and evict one another, and the calls themselves take time. Cut into tiles of a hundred
-environments, and with all loops of a tile in one kernel, the stored values never leave the cache.
+calls the loops one by one. Large programs have hundreds of loops. With 1,024 environments they overflow the caches,
+arrays at equal page offsets evict each other, and the calls themselves take time. In tiles of about a hundred
+environments, with all loops of a tile in one kernel, the stored values never leave the cache.
 
-The primitive, `mujoco_step`, knows its batch: one `vmap` or several of it are again one `mujoco_step`, so that the
-tiles can be chosen when it is lowered. Until then it is a single equation, cheap to transform.
+The primitive, `mujoco_step`, knows its batch: one or several `vmap`s of it are again one `mujoco_step`, so that tiles
+can be chosen when it is lowered. Until then it is a single equation, which is cheap to transform.
 """
 
 from __future__ import annotations
@@ -21,35 +21,35 @@ from jax.extend.core import Primitive
 from jax.interpreters import ad, batching, mlir
 
 from envs.physics.interpreter import Program
-from envs.physics.stages import Stage, as_kernel
+from envs.physics.stages import Stage, make_kernel
 
-# Environments in a tile. Smaller, the loops are too short; from 256 on XLA splits large loops between threads, which
-# cannot be done inside a kernel.
+# Environments per tile. In smaller tiles the loops are too short; from 256 on XLA splits large loops between threads,
+# which is impossible inside a kernel.
 TILE = 128
-LANES = 16  # a tile is a multiple of it, so that no loop has a rest that is not vectorised
-# A program of fewer loops gains nothing: the pendulum's 4 are slower in tiles, a cart-pole's 10 faster.
+LANES = 16  # the size of a tile is a multiple of this, so that loops are fully vectorised
+# Programs with so few loops gain nothing: the pendulum's 4 are slower in tiles, a cart-pole's 10 faster.
 FEW_LOOPS = 8
-# The largest array of one environment, in numbers: XLA splits larger loops between threads too.
+# Size of the largest array of one environment; XLA splits larger loops between threads too.
 LARGEST_ARRAY = 256
 
 
-def in_tiles(program: Program, function_of: Callable[[list[Stage]], Callable[..., tuple]]) -> Callable[..., tuple]:
-    """The function as a `mujoco_step`, whose batch a CPU computes in tiles; as it is, if it gains nothing from it.
+def make_tiled(program: Program, make_function: Callable[[list[Stage]], Callable[..., tuple]]) -> Callable[..., tuple]:
+    """Makes a function into a `mujoco_step`, whose batch a CPU computes in tiles, if it gains from that.
 
     Args:
-      program: what the function computes.
-      function_of: the function of arrays, made of the program's stages or of others that compute the same.
+      program: the program that the function computes.
+      make_function: makes the function of arrays from the program's stages, or from others that compute the same.
 
     Returns:
       A function that can be jitted, batched and differentiated; its derivatives are those of the plain function.
     """
-    function = function_of(program.stages)
+    function = make_function(program.stages)
     num_loops = sum(len(stage.outputs) for stage in program.stages)
     if num_loops <= FEW_LOOPS or max(array.size for array in program.inputs + program.outputs) > LARGEST_ARRAY:
         return function
     kernels = program.kernels()
-    for_tiles = as_kernel(function) if len(kernels) == 1 else function_of(kernels)
-    functions = {"function": function, "for_tiles": for_tiles, "results": tuple(program.results)}
+    tile_function = make_kernel(function) if len(kernels) == 1 else make_function(kernels)
+    functions = {"function": function, "tile_function": tile_function, "results": tuple(program.results)}
     return lambda *arrays: tuple(mujoco_step.bind(*arrays, **functions, is_batched=False))
 
 
@@ -57,15 +57,15 @@ mujoco_step = Primitive("mujoco_step")
 mujoco_step.multiple_results = True
 
 
-def _plain(*arrays, function, is_batched, **_):
+def _run_plain(*arrays, function, is_batched, **_):
     return (jax.vmap(function) if is_batched else function)(*arrays)
 
 
-def _tiled(*arrays, function, for_tiles, is_batched, **_):
-    """Tile by tile; the last tile is filled up with copies of the last environment."""
+def _run_tiled(*arrays, function, tile_function, is_batched, **_):
+    """Runs tile by tile; the last tile is padded with copies of the last environment."""
     if not is_batched:
         return function(*arrays)
-    tile = jax.vmap(for_tiles)
+    tile = jax.vmap(tile_function)
     size = len(arrays[0])
     num_tiles = -(-size // TILE)
     if num_tiles == 1:
@@ -78,39 +78,39 @@ def _tiled(*arrays, function, for_tiles, is_batched, **_):
             x = jnp.concatenate([x, jnp.broadcast_to(x[-1], (padding, *x.shape[1:]))])
         return x.reshape(num_tiles, length, *x.shape[1:])
 
-    found = lax.map(lambda given: tile(*given), tuple(map(cut, arrays)))
-    return tuple(x.reshape(-1, *x.shape[2:])[:size] for x in found)
+    results = lax.map(lambda part: tile(*part), tuple(map(cut, arrays)))
+    return tuple(x.reshape(-1, *x.shape[2:])[:size] for x in results)
 
 
-def _shapes(*arrays, results, is_batched, **_):
+def _infer_shapes(*arrays, results, is_batched, **_):
     batch = arrays[0].shape[:1] if is_batched else ()
     return [ShapedArray((*batch, *x.shape), x.dtype) for x in results]
 
 
 def _batch(arrays, axes, *, is_batched, **params):
-    """One more batch axis: the first one, or merged with that which is there."""
+    """Adds a batch axis, merged with the existing one if there is one."""
     (size,) = {x.shape[axis] for x, axis in zip(arrays, axes, strict=True) if axis is not None}
     arrays = [
         jnp.broadcast_to(x, (size, *x.shape)) if axis is None else jnp.moveaxis(x, axis, 0)
         for x, axis in zip(arrays, axes, strict=True)
     ]
     if not is_batched:
-        found = mujoco_step.bind(*arrays, is_batched=True, **params)
+        results = mujoco_step.bind(*arrays, is_batched=True, **params)
     else:
         inner = arrays[0].shape[1]
-        found = mujoco_step.bind(*(x.reshape(-1, *x.shape[2:]) for x in arrays), is_batched=True, **params)
-        found = [x.reshape(size, inner, *x.shape[1:]) for x in found]
-    return found, [0] * len(found)
+        results = mujoco_step.bind(*(x.reshape(-1, *x.shape[2:]) for x in arrays), is_batched=True, **params)
+        results = [x.reshape(size, inner, *x.shape[1:]) for x in results]
+    return results, [0] * len(results)
 
 
-def _derivative(primals, tangents, **params):
+def _differentiate(primals, tangents, **params):
     tangents = tuple(map(ad.instantiate_zeros, tangents))
-    return jax.jvp(lambda *arrays: list(_plain(*arrays, **params)), tuple(primals), tangents)
+    return jax.jvp(lambda *arrays: list(_run_plain(*arrays, **params)), tuple(primals), tangents)
 
 
-mujoco_step.def_impl(jax.jit(mujoco_step.bind, static_argnames=("function", "for_tiles", "results", "is_batched")))
-mujoco_step.def_abstract_eval(_shapes)
-mlir.register_lowering(mujoco_step, mlir.lower_fun(_plain, multiple_results=True))
-mlir.register_lowering(mujoco_step, mlir.lower_fun(_tiled, multiple_results=True), platform="cpu")
+mujoco_step.def_impl(jax.jit(mujoco_step.bind, static_argnames=("function", "tile_function", "results", "is_batched")))
+mujoco_step.def_abstract_eval(_infer_shapes)
+mlir.register_lowering(mujoco_step, mlir.lower_fun(_run_plain, multiple_results=True))
+mlir.register_lowering(mujoco_step, mlir.lower_fun(_run_tiled, multiple_results=True), platform="cpu")
 batching.primitive_batchers[mujoco_step] = _batch
-ad.primitive_jvps[mujoco_step] = _derivative
+ad.primitive_jvps[mujoco_step] = _differentiate

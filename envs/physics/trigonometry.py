@@ -1,8 +1,7 @@
-"""Sine and cosine of one angle together, as a few products that vectorise.
+"""Sine and cosine of one angle together, as a few operations that vectorise.
 
-XLA's own sine and cosine cost as much as fifty products on a CPU, and physics asks for both of every joint angle. In
-float32 the pair here is within 2^-23 of the truth for |x| <= 1e5, at a seventh of the cost; in other precisions it is
-XLA's.
+On a CPU, XLA's sine and cosine cost as much as fifty products, and physics needs both for every joint angle. In float32
+the pair here has an error of at most 2^-23 for |x| <= 1e5, at a seventh of the cost; other precisions use XLA's.
 """
 
 from __future__ import annotations
@@ -12,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
-# pi/2 in three pieces, each short enough for its product with a whole number below 2^16 to be exact (Cody and Waite).
+# pi/2 in three pieces, each short enough for its product with an integer below 2^16 to be exact (Cody and Waite).
 HALF_PI = (1.5703125, 4.837512969970703125e-4, 7.54978995489188216e-8)
 # (sin(r) - r) / r^3 and (cos(r) - 1 + r^2 / 2) / r^4 in powers of r^2, |r| <= pi/4 (S. Moshier, Cephes, single
 # precision).
@@ -24,8 +23,8 @@ COS = (4.166664568298827e-2, -1.388731625493765e-3, 2.443315711809948e-5)
 def sincos(x: jax.Array) -> tuple[jax.Array, jax.Array]:
     """(sin x, cos x), elementwise.
 
-    x = k pi/2 + r with k whole and |r| <= pi/4; sin r and cos r are polynomials, and k mod 4 says which of the two is
-    which and what signs they have. NaN and infinity give NaN. Beyond |x| = 1e5, where neighbouring float32 numbers are
+    x = k pi/2 + r with integer k and |r| <= pi/4; sin r and cos r are polynomials, and k mod 4 determines their order
+    and signs. NaN and infinity give NaN. Beyond |x| = 1e5, where neighbouring float32 numbers are
     0.008 apart, the results stay in [-1, 1] but their phase is lost. The derivative is the exact one,
     d sin = cos dx and d cos = -sin dx.
     """

@@ -41,7 +41,7 @@ def physics_cache(enabled: bool) -> Iterator[None]:
     Args:
       enabled: without it nothing is read or written.
     """
-    with _ALONE, storage.kept_in(texts.find(PHYSICS) if enabled else None):
+    with _ALONE, storage.use_store(texts.find(PHYSICS) if enabled else None):
         yield
 
 

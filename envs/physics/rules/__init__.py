@@ -1,10 +1,10 @@
-"""One rule per jax primitive: what it does to arrays of scalar expressions.
+"""One rule per jax primitive: its effect on arrays of scalar expressions.
 
 A rule takes the aval (shape and dtype) of its first result, the operands (`envs.physics.arrays`) and the primitive's
-parameters, and gives the result, or the results as a tuple.
+parameters, and returns the result, or a tuple of results.
 
-Adding a primitive is adding one function `(aval, x, y, *, parameter, **_)` to one of the modules here, and a line to
-its RULES. A primitive without a rule raises `UnsupportedPrimitiveError`.
+To add a primitive, add a function `(aval, x, y, *, parameter, **_)` to one of the modules here, and a line to its
+RULES. A primitive without a rule raises `UnsupportedPrimitiveError`.
 """
 
 from collections.abc import Callable

@@ -1,4 +1,4 @@
-"""Rules of the primitives that make arrays of nothing but their parameters."""
+"""Rules of the primitives that make arrays from their parameters alone."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ def _iota(aval, *, dimension, shape, dtype, **_):
 
 
 def _empty(aval, **_):
-    """What nobody reads before it is written; zeros."""
+    """An array that is written before it is read; zeros."""
     return np.zeros(aval.shape, aval.dtype)
 
 
 def _platform_index(aval, *, platforms):
-    """Which of the implementations for different platforms is the one for this one; they compute the same."""
+    """The index of the implementation for this platform; all compute the same."""
     here = next((i for i, names in enumerate(platforms) if names is None or jax.default_backend() in names), 0)
     return np.asarray(here, aval.dtype)
 

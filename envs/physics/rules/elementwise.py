@@ -1,4 +1,4 @@
-"""Rules of the primitives that do the same to every element."""
+"""Rules of the elementwise primitives."""
 
 from __future__ import annotations
 
@@ -10,12 +10,12 @@ from envs.physics.arrays import Array, as_objects, is_numeric, pack
 from envs.physics.folding import NUMPY, fold
 from envs.physics.primitives import apply
 
-# The parameters that change what a primitive computes; the others say how.
+# The parameters that change the result of a primitive.
 MEANINGFUL = {"round": ("rounding_method",), "integer_pow": ("y",), "convert_element_type": ("new_dtype",)}
 
 
 def _map_elements(name: str, aval, /, *arrays: Array, **params) -> Array:
-    """A primitive on arrays, element by element; numbers among them are broadcast."""
+    """Applies a primitive to arrays, element by element; scalars are broadcast."""
     params = tuple((key, _hashable(params[key])) for key in MEANINGFUL.get(name, ()))
     if is_numeric(*arrays):
         return fold(name, *arrays, dtype=aval.dtype, params=params)

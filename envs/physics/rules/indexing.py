@@ -1,4 +1,4 @@
-"""Rules of the primitives that read and write elements at computed places."""
+"""Rules of the primitives that read and write elements at computed indices."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def _dynamic_slice(aval, x, *start, slice_sizes):
 
 def _dynamic_update_slice(aval, x, update, *start):
     if not is_numeric(*start):
-        raise UnsupportedPrimitiveError("dynamic_update_slice: the place depends on the data")
+        raise UnsupportedPrimitiveError("dynamic_update_slice: the index depends on the data")
     start = np.clip(np.array([int(s) for s in start], int), 0, np.subtract(x.shape, update.shape))
     x, update = promote(x, update)
     result = x.copy()
@@ -40,7 +40,7 @@ def _window(x: Array, start, sizes) -> Array:
 
 
 def _traced_index(name: str, indices) -> tuple[int, Expression] | None:
-    """The one index that is an expression, with its place; None if all are known."""
+    """(position, index) of the one index that is an expression; None if all are known."""
     traced = [(i, index.item()) for i, index in enumerate(indices) if isinstance(index.item(), Expression)]
     if len(traced) > 1:
         raise UnsupportedPrimitiveError(f"{name}: more than one index depends on the data")
@@ -102,7 +102,7 @@ def _scatter(aval, x, indices, updates, *, dimension_numbers, mode, update_jaxpr
 
 
 def _combiner(update_jaxpr):
-    """How a scatter joins what is there with what comes: it takes the place, or one primitive joins them."""
+    """The function by which a scatter combines old and new elements: replacement, or one primitive."""
     if update_jaxpr is None or not update_jaxpr.eqns:
         return lambda old, new, aval: new
     (equation,) = update_jaxpr.eqns

@@ -1,4 +1,4 @@
-"""Rules of the primitives that give the elements of their operands another shape or order."""
+"""Rules of the primitives that change only the shape or order of elements."""
 
 from __future__ import annotations
 

@@ -54,7 +54,7 @@ def _cholesky(aval, x, **_):
 
 
 def _triangular_solve(aval, a, b, *, left_side, lower, transpose_a, unit_diagonal, **_):
-    """x with a x = b (or x a = b) by substitution, from the end of `a` where one unknown stands alone."""
+    """x with a x = b (or x a = b), by forward or backward substitution."""
     a, b = as_objects(a), as_objects(b)
     if transpose_a:
         a, lower = a.swapaxes(-1, -2), not lower
@@ -73,7 +73,7 @@ def _triangular_solve(aval, a, b, *, left_side, lower, transpose_a, unit_diagona
 
 def _subtract_products(c: Scalar, xs: np.ndarray, ys: np.ndarray) -> Scalar:
     """c - sum_k x_k y_k."""
-    products = list(map(mul, xs, ys))  # all before any sum: equations have the order in which they are made
+    products = list(map(mul, xs, ys))  # before any sum, as equations keep the order in which they are made
     return sub(c, functools.reduce(add, products, 0))
 
 

@@ -1,4 +1,4 @@
-"""Rules of the primitives that combine the elements along axes: sums, products, extrema, also cumulative."""
+"""Rules of the primitives that reduce or accumulate along axes: sums, products, extrema."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ NUMERIC = {
 
 
 def _reduce(name: str, aval, x, *, axes, **_):
-    """The axes combined with a binary primitive."""
+    """Reduces the axes by a binary primitive."""
     if is_numeric(x) or not x.size:  # the latter also of symbols: there are none
         numbers = x if is_numeric(x) else x.astype(aval.dtype)
         return np.asarray(NUMERIC[name](numbers, tuple(axes))).astype(aval.dtype)
@@ -33,7 +33,7 @@ def _reduce(name: str, aval, x, *, axes, **_):
 
 
 def reduce_pairwise(combine: Callable, items: list):
-    """The items, at least one, combined as a balanced tree: shorter chains and smaller rounding errors.
+    """Combines one or more items as a balanced tree, for shorter chains and smaller rounding errors.
 
     >>> reduce_pairwise("({} {})".format, ["a", "b", "c", "d", "e"])
     '(((a b) (c d)) e)'
@@ -45,7 +45,7 @@ def reduce_pairwise(combine: Callable, items: list):
 
 
 def _accumulate(name: str, aval, x, *, axis, reverse):
-    """The elements along an axis, each combined with all before it."""
+    """Combines each element along an axis with all before it."""
     combine = functools.partial(apply, name, dtype=np.dtype(aval.dtype))
     lines = np.moveaxis(as_objects(x), axis, -1)
     lines = lines[..., ::-1] if reverse else lines

@@ -1,4 +1,4 @@
-"""Rules of the primitives that ask for the order of the elements along an axis."""
+"""Rules of the primitives that depend on the order of the elements along an axis."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from envs.physics.primitives import UnsupportedPrimitiveError, apply
 
 
 def _find_extremum(better: str, aval, x, *, axes, index_dtype, **_):
-    """The places of the elements that no other is "lt" or "gt" to, along one axis."""
+    """The index of the extremum along one axis; `better` is "lt" or "gt"."""
     (axis,) = axes
     lines = np.moveaxis(as_objects(x), axis, -1)
     places = np.ndindex(*lines.shape[:-1])
@@ -20,7 +20,7 @@ def _find_extremum(better: str, aval, x, *, axes, index_dtype, **_):
 
 
 def _first_best(better: str, items: list, index_dtype: np.dtype):
-    """The place of the first extremum; of the first NaN if there is one."""
+    """The index of the first extremum, or of the first NaN if there is one."""
     dtype = next((item.dtype for item in items if isinstance(item, Expression)), np.dtype(float))
     test = functools.partial(apply, dtype=np.dtype(bool))
     best, index = items[0], 0
