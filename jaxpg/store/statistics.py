@@ -105,9 +105,18 @@ def bootstrap_interval(
     scores = np.asarray(scores, float)
     if len(scores) < min_seeds(confidence):
         return np.full(scores.shape[1:], np.nan), np.full(scores.shape[1:], np.nan)
-    draws = np.random.default_rng(seed).integers(len(scores), size=(resamples, len(scores)))
-    means, tail = np.stack([interquartile_mean(scores[draw]) for draw in draws]), (1 - confidence) / 2
-    return np.quantile(means, tail, axis=0), np.quantile(means, 1 - tail, axis=0)
+    from scipy import stats  # slow to import
+
+    interval = stats.bootstrap(
+        (scores,),
+        lambda samples, axis: interquartile_mean(np.moveaxis(samples, axis, 0)),
+        axis=0,
+        confidence_level=confidence,
+        n_resamples=resamples,
+        method="percentile",
+        rng=seed,
+    ).confidence_interval
+    return np.asarray(interval.low), np.asarray(interval.high)
 
 
 def seed_interval(scores: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -150,8 +159,9 @@ def probability_of_improvement(x: np.ndarray, y: np.ndarray) -> float:
     >>> probability_of_improvement(np.array([1.0, 2.0]), np.array([1.0, 0.0]))
     0.875
     """
-    x, y = np.asarray(x, float)[:, None], np.asarray(y, float)
-    return float(np.mean((x > y) + (x == y) / 2))
+    from scipy import stats  # slow to import
+
+    return float(stats.mannwhitneyu(x, y).statistic) / (len(x) * len(y))
 
 
 def improvement_interval(x: np.ndarray, y: np.ndarray, confidence: float = CONFIDENCE) -> tuple[float, float]:
