@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 
 import pytest
 
+from jaxpg.watch.bundle import bundle
 from jaxpg.watch.page import PARTS
 
 NAMES = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable")
@@ -77,9 +78,9 @@ def stage_pixel(tab, data, x, y):
     return pixel(tab, "#stage", (x - left) / (right - left), (high - y) / (high - low))
 
 
-def computed(tab, files, expression, argument=None):
-    """The value of JavaScript that uses the functions of some of the page's files."""
-    code = "".join((PARTS / f"{name}.js").read_text(encoding="utf-8") for name in files)
+def computed(tab, names, expression, argument=None):
+    """The value of JavaScript that uses the functions of some of the page's modules."""
+    code = bundle(PARTS, *(f"{name}.js" for name in names))
     return tab.evaluate(f"(argument) => {{ {code}; return {expression}; }}", argument)
 
 

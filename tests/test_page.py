@@ -12,7 +12,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from jaxpg.watch.page import PARTS, SCRIPTS, make_page
+from jaxpg.watch.bundle import IMPORT, TOP
+from jaxpg.watch.page import PARTS, make_page
 
 
 class Document(HTMLParser):
@@ -51,12 +52,23 @@ def test_the_policy_allows_this_style_and_this_script_and_nothing_else():
         assert document.policy[rule] == f"'sha256-{digest}'"
 
 
-def test_every_script_is_in_the_page_and_none_is_long():
-    assert sorted(SCRIPTS) == sorted(path.stem for path in PARTS.glob("*.js"))
+def test_every_script_is_in_the_page_once_and_none_is_long():
+    """Each begins with a comment that says what it is for."""
+    script = Document(make_page(pages.pendulum())).texts["script", "module"].splitlines()
+    assert not [line for line in script if re.match(r"\s*(import|export)\b", line)]
     for path in PARTS.glob("*.js"):
         lines = path.read_text(encoding="utf-8").splitlines()
+        assert lines[0].startswith("// ")
+        assert script.count(lines[0]) == 1, path
         assert len(lines) < 250, path
         assert max(map(len, lines)) <= 120, path
+
+
+def test_scripts_export_what_others_import_and_nothing_else():
+    texts = {path.name: path.read_text(encoding="utf-8") for path in PARTS.glob("*.js")}
+    exported = {(name, top) for name, text in texts.items() for export, top in TOP.findall(text) if export}
+    imported = [(file, names.split(",")) for text in texts.values() for names, file in IMPORT.findall(text)]
+    assert exported == {(file, name.strip()) for file, names in imported for name in names}
 
 
 @given(st.text(), st.lists(st.tuples(st.text(), st.text())))

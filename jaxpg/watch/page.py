@@ -11,26 +11,9 @@ from pathlib import Path
 from string import Template
 from typing import Any
 
+from jaxpg.watch.bundle import bundle
+
 PARTS = Path(__file__).with_name("page")
-SCRIPTS = (  # joined in this order into one module
-    "dom",
-    "theme",
-    "numbers",
-    "palette",
-    "axes",
-    "rollout",
-    "outline",
-    "stage",
-    "player",
-    "keys",
-    "panels",
-    "contours",
-    "portrait",
-    "workspace",
-    "curves",
-    "tables",
-    "main",
-)
 
 
 def make_page(data: Mapping[str, Any]) -> str:
@@ -45,7 +28,7 @@ def make_page(data: Mapping[str, Any]) -> str:
       ValueError: a number is not finite.
       TypeError: a value has no JSON form.
     """
-    style, script = _read_part("page.css"), "\n".join(_read_part(f"{name}.js") for name in SCRIPTS)
+    style, script = _read_part("page.css"), bundle(PARTS, "main.js")
     return Template(_read_part("page.html")).substitute(
         policy=_make_policy(style, script), title=_escape(data["title"]), style=style, script=script, data=_embed(data)
     )

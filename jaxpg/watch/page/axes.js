@@ -1,22 +1,24 @@
 // Axes of a figure: scales, grid, ticks and labels.
 
-const FONT = 12; // pixels; as in the style sheet
+import { shape } from "./dom.js";
+
+export const FONT = 12; // pixels; as in the style sheet
 const DIGIT = 7.6; // width of a character of a tick's text, about
 
 /** x -> pixels, and back by .back(pixels). */
-function linear([low, high], [from, to]) {
+export function linear([low, high], [from, to]) {
   const scale = (value) => from + ((value - low) / (high - low)) * (to - from);
   scale.back = (pixels) => low + ((pixels - from) / (to - from)) * (high - low);
   return scale;
 }
 
 /** The room that ticks of a vertical axis need to the left of it. */
-function tickRoom(marks) {
+export function tickRoom(marks) {
   return Math.ceil(Math.max(...marks.map((one) => one.text.length)) * DIGIT) + 8;
 }
 
 /** How many ticks fit into a width. */
-function fitting(width) {
+export function fitting(width) {
   return Math.max(2, Math.floor(width / 75));
 }
 
@@ -25,7 +27,7 @@ function fitting(width) {
  * x and y are {range, ticks, label}; a label of null leaves out the axis' texts as well.
  * Returns the scales {X, Y} and `inside`, a group that is clipped to the box.
  */
-function axes(svg, box, x, y) {
+export function axes(svg, box, x, y) {
   const X = linear(x.range, [box.left, box.left + box.width]);
   const Y = linear(y.range, [box.top + box.height, box.top]);
   const bottom = box.top + box.height;
@@ -52,16 +54,16 @@ function clip(svg, box) {
   return id;
 }
 
-function rule(x1, y1, x2, y2, kind = null) {
+export function rule(x1, y1, x2, y2, kind = null) {
   return shape("line", { x1, y1, x2, y2, class: kind });
 }
 
-function label(x, y, anchor, words, kind = null) {
+export function label(x, y, anchor, words, kind = null) {
   return shape("text", { x, y, "text-anchor": anchor, class: kind }, words);
 }
 
 /** The path of a line through points; a gap where a coordinate is null. */
-function linePath(points) {
+export function linePath(points) {
   let down = false;
   let path = "";
   for (const [x, y] of points) {
@@ -73,6 +75,6 @@ function linePath(points) {
 }
 
 /** y of a scale, or null where there is no value. */
-function at(scale, value) {
+export function at(scale, value) {
   return value === null || value === undefined ? null : scale(value);
 }

@@ -1,7 +1,7 @@
 // Lines of equal value on a grid.
 
 /** The segments [[x0, y0], [x1, y1]] in columns and rows where the values cross a level. */
-function contour(values, columns, rows, level) {
+export function contour(values, columns, rows, level) {
   const segments = [];
   for (let row = 0; row + 1 < rows; row++) {
     for (let column = 0; column + 1 < columns; column++) {

@@ -1,6 +1,11 @@
 // Learning curves with intervals; pointing at them, or the arrow keys, read values.
 
-function curves(panel, numberOf) {
+import { at, axes, fitting, FONT, label, linePath, rule, tickRoom } from "./axes.js";
+import { element, figure, onWidth, shape } from "./dom.js";
+import { clamp, extent, text, ticks } from "./numbers.js";
+import { seriesClass } from "./palette.js";
+
+export function curves(panel, numberOf) {
   const steps = [...new Set(panel.series.flatMap((one) => one.steps))].sort((a, b) => a - b);
   const holder = element("div", { class: "curve", tabindex: 0, role: "slider" });
   holder.setAttribute("aria-label", `${panel.title}: read values`);

@@ -3,12 +3,12 @@
 const DRAWING = "http://www.w3.org/2000/svg"; // the name of SVG's elements; nothing is fetched from it
 
 /** An HTML element; attributes that are null or false are left out, children are elements or texts. */
-function element(name, attributes = {}, ...children) {
+export function element(name, attributes = {}, ...children) {
   return filled(document.createElement(name), attributes, children);
 }
 
 /** An SVG element. */
-function shape(name, attributes = {}, ...children) {
+export function shape(name, attributes = {}, ...children) {
   return filled(document.createElementNS(DRAWING, name), attributes, children);
 }
 
@@ -22,12 +22,12 @@ function filled(node, attributes, children) {
 }
 
 /** A figure: a title, whatever is drawn, and a line of text below. */
-function figure(title, ...children) {
+export function figure(title, ...children) {
   return element("figure", {}, element("h3", {}, title), ...children);
 }
 
 /** Calls draw(width) now that the node has a width, and whenever it has another one. */
-function onWidth(node, draw) {
+export function onWidth(node, draw) {
   let known = 0;
   new ResizeObserver(() => {
     const width = Math.floor(node.clientWidth);
@@ -38,7 +38,7 @@ function onWidth(node, draw) {
 }
 
 /** The mark of an episode: a disc for success, a cross for failure, so that colour is not needed. */
-function mark(success, x, y, size, ...children) {
+export function mark(success, x, y, size, ...children) {
   const path = success ? disc(x, y, size) : cross(x, y, size * 0.85);
   return shape("path", { d: path, class: success ? "success" : "failure" }, ...children);
 }
@@ -52,6 +52,6 @@ function cross(x, y, r) {
 }
 
 /** A mark among words. */
-function inlineMark(success) {
+export function inlineMark(success) {
   return shape("svg", { class: "mark", width: 10, height: 10, "aria-hidden": "true" }, mark(success, 5, 5, 4));
 }

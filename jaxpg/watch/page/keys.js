@@ -1,5 +1,9 @@
 // The keyboard. Keys go to the player while it can be seen and nothing else that has the focus needs them.
 
+import { element } from "./dom.js";
+import { goTo, toggle } from "./player.js";
+import { chosen, frameOf } from "./rollout.js";
+
 const KEYS_IN_WORDS = [
   [["Space"], "play, pause"],
   [["←", "→"], "a frame"],
@@ -10,14 +14,14 @@ const KEYS_IN_WORDS = [
 ];
 
 /** The short line that says them. */
-function keysLine() {
+export function keysLine() {
   const parts = KEYS_IN_WORDS.map(([keys, words]) =>
     element("span", {}, ...keys.map((key) => element("kbd", {}, key)), ` ${words}`),
   );
   return element("p", { class: "keys" }, ...parts);
 }
 
-function startKeys(player, view) {
+export function startKeys(player, view) {
   const actions = keyActions(player, view);
   document.addEventListener("keydown", (event) => {
     const typed = event.getModifierState("AltGraph"); // brackets need it on some keyboards

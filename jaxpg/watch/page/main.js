@@ -1,5 +1,17 @@
 // The page from top to bottom; what the data does not have is not there.
 
+import { curves } from "./curves.js";
+import { element } from "./dom.js";
+import { keysLine, startKeys } from "./keys.js";
+import { seriesNumbers } from "./palette.js";
+import { panels } from "./panels.js";
+import { choices, stage } from "./player.js";
+import { portrait } from "./portrait.js";
+import { shared, startOf } from "./rollout.js";
+import { facts, folded, improvement, noted } from "./tables.js";
+import { startTheme } from "./theme.js";
+import { workspace } from "./workspace.js";
+
 const data = JSON.parse(document.getElementById("data").textContent);
 
 function section(title, ...children) {

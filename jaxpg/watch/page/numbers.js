@@ -1,14 +1,14 @@
 // Numbers: out of their packing, along an axis, and as text.
 
 /** Integers out of base64 of little-endian int16. */
-function unpack(packed) {
+export function unpack(packed) {
   const bytes = Uint8Array.from(atob(packed), (character) => character.charCodeAt(0));
   const view = new DataView(bytes.buffer);
   return Int16Array.from({ length: bytes.length / 2 }, (_, i) => view.getInt16(2 * i, true));
 }
 
 /** Least and greatest of lists of numbers, nulls left out, with some room; [0, 1] where there are none. */
-function extent(lists, room = 0) {
+export function extent(lists, room = 0) {
   let low = Infinity;
   let high = -Infinity;
   for (const list of lists) {
@@ -24,14 +24,14 @@ function extent(lists, room = 0) {
 }
 
 /** 1, 2 or 5 times a power of ten: the least such step that takes at most `count` steps over the span. */
-function niceStep(span, count) {
+export function niceStep(span, count) {
   const power = 10 ** Math.floor(Math.log10(span / count));
   const factor = [1, 2, 5, 10].find((f) => f * power * count >= span * (1 - 1e-9)) ?? 10;
   return factor * power;
 }
 
 /** Values at which an axis is marked, and the text of each. */
-function ticks([low, high], count) {
+export function ticks([low, high], count) {
   const step = niceStep(high - low, count);
   const values = [];
   for (let i = Math.ceil(low / step - 1e-9); i * step <= high + step * 1e-9; i++) values.push(i * step || 0);
@@ -40,7 +40,7 @@ function ticks([low, high], count) {
 }
 
 /** Ticks of an angle that goes once around: multiples of pi / 2. */
-function angleTicks() {
+export function angleTicks() {
   const texts = ["−π", "−π/2", "0", "π/2", "π"];
   return texts.map((text, i) => ({ value: ((i - 2) * Math.PI) / 2, text }));
 }
@@ -54,7 +54,7 @@ function tickText(value, step, largest) {
 }
 
 /** A number to be read: four digits, whole thousands grouped; a dash where there is none. */
-function text(value) {
+export function text(value) {
   if (value === null || value === undefined) return "–";
   const size = Math.abs(value);
   if (size >= 1e9 || (size > 0 && size < 1e-4)) return minus(value.toExponential(3));
@@ -63,7 +63,7 @@ function text(value) {
 }
 
 /** A number with so many decimals, for readings that change while one looks: the width stays the same. */
-function fixed(value, decimals) {
+export function fixed(value, decimals) {
   if (value === null || value === undefined) return "–";
   const rounded = value.toFixed(decimals);
   return minus(Number(rounded) === 0 ? rounded.replace("-", "") : rounded);
@@ -73,6 +73,6 @@ function minus(string) {
   return string.replaceAll("-", "−");
 }
 
-function clamp(value, low, high) {
+export function clamp(value, low, high) {
   return Math.min(Math.max(value, low), high);
 }

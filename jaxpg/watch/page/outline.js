@@ -1,12 +1,12 @@
 // The outline of a part: the convex hull of what the camera sees of its points.
 
 /** Where the camera sees the points of a part: place + turn * point. */
-function pointsSeen(part, [x, y, xx, xy, xz, yx, yy, yz]) {
+export function pointsSeen(part, [x, y, xx, xy, xz, yx, yy, yz]) {
   return part.points.map(([a, b, c]) => [x + xx * a + xy * b + xz * c, y + yx * a + yy * b + yz * c]);
 }
 
 /** The corners of the convex hull, going around it. */
-function hull(points) {
+export function hull(points) {
   const sorted = [...points].sort(([ax, ay], [bx, by]) => ax - bx || ay - by);
   return [...halfHull(sorted), ...halfHull(sorted.reverse())];
 }

@@ -1,6 +1,9 @@
 // Colours of a map: lightness rises evenly from low to high, the hue turns from indigo over teal to yellow.
 
-const SHADES = 256;
+import { element } from "./dom.js";
+import { clamp } from "./numbers.js";
+
+export const SHADES = 256;
 
 /** sRGB of a shade in [0, 1], computed in OKLab, where equal steps look equal. */
 function shade(t) {
@@ -27,7 +30,7 @@ function gamma(linear) {
 const SHADE_TABLE = Array.from({ length: SHADES }, (_, i) => shade(i / (SHADES - 1)));
 
 /** A picture of columns x rows pixels; paint(column, row) is a shade in [0, 1], row 0 at the lower edge. */
-function shadePicture(columns, rows, paint) {
+export function shadePicture(columns, rows, paint) {
   const canvas = element("canvas", { width: columns, height: rows });
   const context = canvas.getContext("2d");
   const image = context.createImageData(columns, rows);
@@ -42,7 +45,7 @@ function shadePicture(columns, rows, paint) {
 }
 
 /** Which colour of the series each label has: the same in every panel that shows several. */
-function seriesNumbers(panels) {
+export function seriesNumbers(panels) {
   const numbers = new Map();
   for (const panel of panels) {
     for (const { label } of panel.series) if (!numbers.has(label)) numbers.set(label, numbers.size);
@@ -53,6 +56,6 @@ function seriesNumbers(panels) {
 const SERIES_COLOURS = 7;
 
 /** Classes of a series' colour, and of its dashes once the colours are used up. */
-function seriesClass(number) {
+export function seriesClass(number) {
   return `series s${number % SERIES_COLOURS} d${Math.floor(number / SERIES_COLOURS) % 3}`;
 }

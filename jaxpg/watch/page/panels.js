@@ -1,8 +1,14 @@
 // What happens over time: a panel for each series, with a cursor at the player's time.
 
+import { at, axes, fitting, label, linePath, rule, tickRoom } from "./axes.js";
+import { element, onWidth, shape } from "./dom.js";
+import { clamp, extent, fixed, ticks } from "./numbers.js";
+import { goTo } from "./player.js";
+import { chosen, frameOf, ghostOf } from "./rollout.js";
+
 const PANEL_GAP = 34; // above each, for its title
 
-function panels(player, view) {
+export function panels(player, view) {
   const holder = element("figure", { class: "panels" }, element("h3", {}, "over time"));
   let drawing = null;
   const draw = () => {

@@ -1,9 +1,15 @@
 // The player: choice of policy and episode, the stage, and the bar below it.
 
+import { element, inlineMark, onWidth, shape } from "./dom.js";
+import { clamp, fixed, text } from "./numbers.js";
+import { chosen, decimals, frameOf } from "./rollout.js";
+import { paintStage } from "./stage.js";
+import { onTheme } from "./theme.js";
+
 const SPEEDS = [0.25, 0.5, 1, 2, 4];
 
 /** The choices above the linked views. */
-function choices(player, view) {
+export function choices(player, view) {
   const policies = radios("policy", player.policies.map(policyName), view, "policy");
   const episodes = radios("episode", player.policies[0].episodes.map((_, i) => [String(i + 1)]), view, "episode");
   const box = element("input", { type: "checkbox", id: "ghost" });
@@ -48,13 +54,13 @@ function markEpisodes(group, episodes) {
   });
 }
 
-function ending(episode) {
+export function ending(episode) {
   if (episode.success === null) return "";
   return episode.success ? ", success" : ", no success";
 }
 
 /** The stage with its bar; starts the clock. */
-function stage(player, view) {
+export function stage(player, view) {
   const canvas = element("canvas", { id: "stage", tabindex: 0, role: "img", "aria-label": "drawing of the rollout" });
   const reading = element("p", { class: "reading", id: "so-far" });
   const paint = () => {
@@ -118,12 +124,12 @@ function playIcon() {
 }
 
 /** Shows a frame, at rest. */
-function goTo(player, view, frame) {
+export function goTo(player, view, frame) {
   view.set({ playing: false, position: clamp(Math.round(frame), 0, chosen(player, view.state).frames - 1) });
 }
 
 /** Plays or pauses; from the beginning if it is at the end. */
-function toggle(player, view) {
+export function toggle(player, view) {
   const episode = chosen(player, view.state);
   const frame = frameOf(episode, view.state);
   if (view.state.playing) view.set({ playing: false, position: frame });

@@ -1,6 +1,13 @@
 // The phase portrait: the value function as a map, and the episode's path over it.
 
-function portrait(data, player, view) {
+import { axes, fitting, label, linear, linePath, rule, tickRoom } from "./axes.js";
+import { contour } from "./contours.js";
+import { element, figure, onWidth, shape } from "./dom.js";
+import { angleTicks, clamp, extent, fixed, text, ticks, unpack } from "./numbers.js";
+import { shadePicture, SHADES } from "./palette.js";
+import { chosen, frameOf } from "./rollout.js";
+
+export function portrait(data, player, view) {
   const maps = data.values.map((grid) => mapOf(grid, data));
   const range = extent(maps.map((map) => [map.low, map.high]));
   const holder = element("div", { class: "map" });

@@ -1,7 +1,9 @@
 // What the linked views share: which episode of which policy, and where in it.
 
+import { clamp, unpack } from "./numbers.js";
+
 /** A state whose listeners are called with the names that have changed. */
-function shared(state) {
+export function shared(state) {
   const listeners = [];
   return {
     state,
@@ -15,7 +17,7 @@ function shared(state) {
 }
 
 /** The state at the start: the last but one policy is the best where there are three, so the second is shown. */
-function startOf(data) {
+export function startOf(data) {
   const policies = data.player?.policies ?? data.workspace?.points ?? data.portrait?.values ?? [];
   return { policy: Math.min(1, policies.length - 1), episode: 0, position: 0, speed: 1, playing: false, ghost: false };
 }
@@ -41,20 +43,20 @@ function returnsSoFar(episode) {
 }
 
 /** The episode that is chosen. */
-function chosen(player, state) {
+export function chosen(player, state) {
   return recorded(player.policies[state.policy].episodes[state.episode]);
 }
 
 /** The same episode by the first policy; null where it is not asked for or is the chosen one. */
-function ghostOf(player, state) {
+export function ghostOf(player, state) {
   return state.ghost && state.policy > 0 ? recorded(player.policies[0].episodes[state.episode]) : null;
 }
 
 /** The frame that is shown, a whole number. */
-function frameOf(episode, state) {
+export function frameOf(episode, state) {
   return clamp(Math.floor(state.position + 1e-6), 0, episode.frames - 1);
 }
 
-function decimals(dt) {
+export function decimals(dt) {
   return clamp(Math.ceil(-Math.log10(dt) - 1e-9), 1, 3);
 }

@@ -1,7 +1,13 @@
 // The drawing of a rollout: the robot's parts, the goal, and the motors' torques as arcs.
 
+import { FONT } from "./axes.js";
+import { clamp, extent, niceStep } from "./numbers.js";
+import { hull, pointsSeen } from "./outline.js";
+import { chosen, frameOf, ghostOf } from "./rollout.js";
+import { colour } from "./theme.js";
+
 /** Paints the chosen episode, and the ghost behind it, at the state's position. */
-function paintStage(canvas, player, state) {
+export function paintStage(canvas, player, state) {
   const context = sharp(canvas);
   const place = placing(canvas, player.view);
   const episode = chosen(player, state);

@@ -1,6 +1,9 @@
 // Facts, tables, the probabilities of improvement, and what is folded away.
 
-function facts(rows) {
+import { element } from "./dom.js";
+import { fixed } from "./numbers.js";
+
+export function facts(rows) {
   return element("dl", { class: "facts" }, ...rows.map(pair));
 }
 
@@ -11,7 +14,7 @@ function pair([name, words]) {
 const NUMBER = /^([−-]?[\d.]|[–-]$|$)/; // what a cell about numbers begins with
 
 /** A table, and what is to be said of it. */
-function noted({ title, columns, rows, note }) {
+export function noted({ title, columns, rows, note }) {
   return [table(title, columns, rows), note ? element("p", { class: "note" }, note) : null].filter(Boolean);
 }
 
@@ -40,7 +43,7 @@ const IMPROVEMENT =
   "interval excludes one half. There is no interval if there are too few seeds.";
 
 /** P(row > column) of all pairs. */
-function improvement({ labels, probability, low, high }) {
+export function improvement({ labels, probability, low, high }) {
   const numbers = labels.map((name, i) => element("th", { scope: "col", class: "number", title: name }, String(i + 1)));
   const rows = labels.map((name, i) => {
     const cells = labels.map((_, j) => probabilityCell(probability[i][j], low?.[i]?.[j], high?.[i]?.[j]));
@@ -62,7 +65,7 @@ function probabilityCell(p, low, high) {
 }
 
 /** Pairs of name and value, folded; those with a default have another value than that. */
-function folded(title, rows) {
+export function folded(title, rows) {
   const different = rows.filter(differs).length;
   const number = different ? `${rows.length}, ${different} not the default` : String(rows.length);
   const pairs = element("dl", { class: "pairs" }, ...rows.map(option));

@@ -1,15 +1,17 @@
 // Light and dark: the system's choice until the button says otherwise; paper is always light.
 
+import { element } from "./dom.js";
+
 const themeListeners = [];
 const colours = new Map();
 
 /** Calls draw() whenever the colours change; needed by canvases, which do not follow the style sheet. */
-function onTheme(draw) {
+export function onTheme(draw) {
   themeListeners.push(draw);
 }
 
 /** The value that a colour of the style sheet has now, as "rgb(...)". */
-function colour(name) {
+export function colour(name) {
   if (!colours.has(name)) {
     const probe = document.body.appendChild(element("span", { hidden: true }));
     probe.style.color = `var(--${name})`;
@@ -39,7 +41,7 @@ function showTheme() {
   for (const draw of themeListeners) draw();
 }
 
-function startTheme() {
+export function startTheme() {
   let before;
   document.getElementById("theme").addEventListener("click", () => setTheme(isDark() ? "light" : "dark"));
   for (const media of ["(prefers-color-scheme: dark)", "print"]) {

@@ -1,6 +1,11 @@
 // The workspace: where the goals of many episodes lay, and which of them were reached.
 
-function workspace(data, player, view) {
+import { axes, label, tickRoom } from "./axes.js";
+import { element, figure, inlineMark, mark, onWidth, shape } from "./dom.js";
+import { text, ticks } from "./numbers.js";
+import { ending } from "./player.js";
+
+export function workspace(data, player, view) {
   const holder = element("div", { class: "workspace" });
   const counts = element("table", { class: "counts" });
   const draw = () => {
