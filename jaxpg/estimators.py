@@ -21,8 +21,7 @@ multiplied by `jaxpg.returns.discount_factors`, all estimate grad J itself. `rei
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import NamedTuple
+from typing import NamedTuple, Protocol
 
 import jax
 import jax.numpy as jnp
@@ -183,8 +182,16 @@ def td_lambda(
     return Estimate(returns - check_shape(value, returns, "value"), returns)
 
 
-# estimate(reward, discount, value, next_value, continues) -> Estimate; trajectories may be cut
-Estimator = Callable[[jax.Array, jax.Array, jax.Array, jax.Array, jax.Array], Estimate]
+class Estimator(Protocol):
+    """`estimate(reward, discount, value, next_value, continues) -> Estimate`, of trajectories that may be cut.
+
+    All arrays are `[T, N]`: r_t; d_t, which is gamma, or 0 if s_{t+1} is terminal; V(s_t); V of the true s_{t+1}; and
+    c_t, which is 0 at a time limit, after which the next row belongs to another episode, and else 1.
+    """
+
+    def __call__(
+        self, reward: jax.Array, discount: jax.Array, value: jax.Array, next_value: jax.Array, continues: jax.Array, /
+    ) -> Estimate: ...
 
 
 def gae(lambda_: jax.Array | float) -> Estimator:

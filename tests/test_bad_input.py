@@ -26,7 +26,10 @@ MISTAKES = {
     "misspelt algorithm": (["algo=reinforc"], "unknown algo 'reinforc': did you mean 'reinforce'?"),
     "unknown algorithm": (["algo=xyz"], "unknown algo 'xyz': known are online, ppo, reinforce, td"),
     "list of algorithms": (["algo=[td,ppo]"], "unknown algo '['td', 'ppo']': known are online, ppo, reinforce, td"),
-    "option of another algorithm": (["algo.baseline=mean"], "unknown option 'algo.baseline'"),
+    "option of another algorithm": (
+        ["algo=td", "algo.baseline=mean"],
+        "algo=td has no option algo.baseline; reinforce has it",
+    ),
     "option of another environment": (["env.goal_min=0.3"], "unknown option 'env.goal_min'"),
     "word for a number": (["num_envs=many"], "num_envs=many: expected a whole number"),
     "fraction for a count": (["num_envs=2.5"], "num_envs=2.5: expected a whole number"),
@@ -38,7 +41,10 @@ MISTAKES = {
         "network.features=fourier network.order=9: 9,999,999",
     ),
     "one radial bump": (["network=linear", "network.features=radial", "network.order=1"], "at least 2 points"),
-    "widths of a linear network": (["network=linear", "network.widths=[8]"], "unknown option 'network.widths'"),
+    "widths of a linear network": (
+        ["network=linear", "network.widths=[8]"],
+        "network=linear has no option network.widths; mlp has it",
+    ),
     "zero environments": (["num_envs=0"], "num_envs=0: must be at least 1"),
     "zero width": (["network.widths=[64,0]"], "must be at least 1"),
     "negative steps": (["total_steps=-5"], "total_steps=-5: must be at least 1"),
@@ -228,7 +234,7 @@ RUN_MISTAKES = {
     "misspelt backend": (evaluate, ["run={run}", "backend=gym"], "must be mjx or mujoco or gymnasium"),
     "misspelt evaluation option": (evaluate, ["run={run}", "episode=3"], "did you mean 'episodes'?"),
     "one episode": (evaluate, ["run={run}", "episodes=1"], "episodes=1: must be at least 2"),
-    "no such agent": (evaluate, ["run={run}", "agent=1"], "agent=1: the run has agents 0 to 0"),
+    "no such agent": (evaluate, ["run={run}", "agent=1"], "agent=1: the run has one agent, 0"),
     "gymnasium with another pendulum": (
         evaluate,
         ["run={run}", "backend=gymnasium"],

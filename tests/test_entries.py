@@ -9,9 +9,10 @@ from in_process import ended
 from envs.options import option
 from jaxpg import evaluate, export, train
 from jaxpg.actor_critic import actor_critic
-from jaxpg.config import schema
+from jaxpg.config import command_options, schema
 from jaxpg.config.entries import ALGORITHMS, NETWORKS, Entry
 from jaxpg.config.schema import Common, Gaussian, number
+from jaxpg.deploy import exporter
 from jaxpg.distributions import GAUSSIAN, SQUASHED_GAUSSIAN
 from jaxpg.methods import td
 from jaxpg.networks import mlp_networks
@@ -81,3 +82,4 @@ def test_names_of_options_are_those_of_the_functions():
     assert tuple(networks.ACTIVATIONS) == schema.ACTIVATIONS
     assert schema.FEATURES == tuple(networks.FEATURES) == tuple(networks.NUM_FEATURES)
     assert tuple(networks.SIGMAS) == schema.SIGMAS
+    assert tuple(exporter.FORMATS) == command_options.EXPORT_FORMATS

@@ -15,6 +15,7 @@ from envs.base import Interface
 from jaxpg import export as command_line
 from jaxpg.deploy import c
 from jaxpg.deploy.controller import make_controller
+from jaxpg.deploy.exporter import FORMATS
 from jaxpg.deploy.identifiers import MAX_LENGTH, make_identifier
 from jaxpg.deploy.sealing import NO_SEAL, add_seal, is_sealed
 from jaxpg.errors import UserError
@@ -37,6 +38,10 @@ FILES = {
     "onnx": {"quadratic.onnx"},
     "stablehlo": {"quadratic.stablehlo", "quadratic.mlir"},
 }
+
+
+def test_the_files_of_every_format_are_known():
+    assert set(FILES) >= set(FORMATS)
 
 
 @pytest.mark.parametrize("form", FILES)

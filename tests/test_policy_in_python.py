@@ -38,6 +38,11 @@ def drawn(monkeypatch):
     return make
 
 
+def test_a_policy_is_shown_by_its_names(drawn):
+    _, policy = drawn("env=pendulum")
+    assert repr(policy) == "Policy(cos(theta), sin(theta), theta' [rad/s] -> torque [N m])"
+
+
 def test_commands_are_the_formulas(drawn):
     stored, policy = drawn("env=arm", "network.widths=[8]")
     obs = np.random.default_rng(0).normal(size=(5, 4, policy.observation_size))

@@ -6,6 +6,8 @@ from dataclasses import dataclass
 
 from envs.options import option
 
+EXPORT_FORMATS = ("c", "onnx", "stablehlo")  # a test compares the names with the table
+
 
 @dataclass(frozen=True)
 class EvaluateOptions:
@@ -17,7 +19,7 @@ class EvaluateOptions:
     backend: str = option(
         "mjx", "simulate the run's environment, in C MuJoCo, or in Gymnasium", choices=("mjx", "mujoco", "gymnasium")
     )
-    policy: str = option("jax", "the trained policy, or an export of it", choices=("jax", "c", "onnx", "stablehlo"))
+    policy: str = option("jax", "the trained policy, or an export of it", choices=("jax", *EXPORT_FORMATS))
     checkpoint: str = option(
         "best", "the policy with the best evaluation in training, or the last one", choices=("best", "last")
     )
@@ -32,7 +34,7 @@ class ExportOptions:
 
     run: str | None = option(None, "run folder; required")
     format: str = option(
-        "c", "a C99 header, an ONNX model, a StableHLO program, or all", choices=("c", "onnx", "stablehlo", "all")
+        "c", "a C99 header, an ONNX model, a StableHLO program, or all", choices=(*EXPORT_FORMATS, "all")
     )
     out: str | None = option(None, "folder to write into [default: export in the run folder]")
     name: str | None = option(None, "prefix of files and C identifiers [default: the environment's name]")

@@ -129,9 +129,22 @@ def check_choices(choices: Mapping[str, Any]) -> None:
 
 
 def describe_unknown_names(given: Mapping[str, Any], choices: Mapping[str, Any]) -> list[str]:
-    """One line for each name that is neither an option nor a group."""
+    """One line for each name that is neither an option nor a group; other members of its group may have it."""
     known = {*find_option_fields(choices), *GROUPS}
-    return [describe_unknown("option", name, known) for name in given if name not in known]
+    return [
+        _describe_other_members(name, choices) or describe_unknown("option", name, known)
+        for name in given
+        if name not in known
+    ]
+
+
+def _describe_other_members(name: str, choices: Mapping[str, Any]) -> str | None:
+    """`GROUP=MEMBER has no NAME; GROUP=OTHER has it` if so; else None."""
+    group, _, leaf = name.partition(".")
+    if group not in ("algo", "network"):
+        return None
+    others = [member for member in GROUPS[group] if f"{group}.{leaf}" in find_option_fields({group: member})]
+    return (others and f"{group}={choices[group]} has no option {name}; {' or '.join(others)} has it") or None
 
 
 def to_yaml(config: Config) -> str:

@@ -45,6 +45,9 @@ class Policy:
     action_fn: Callable[[Parameters, Any], jax.Array]
     value_fn: Callable[[Parameters, Any], jax.Array]
 
+    def __repr__(self) -> str:
+        return f"Policy({', '.join(self.interface.observations)} -> {', '.join(self.interface.commands)})"
+
     def __call__(self, obs: Any) -> np.ndarray:
         """The command, in physical units; like all methods, raises ValueError unless the shape is `[..., n]`."""
         return np.asarray(self.command_fn(self.params, self._observation(obs)))

@@ -101,13 +101,23 @@ def _check_name(path: Path) -> None:
 def check_empty(folder: RunFolder) -> None:
     """Raises UserError if the folder is not empty, or cannot be one."""
     if _list_names(folder.path):
-        raise UserError(f"{folder.path} is not empty: choose another run_dir, or resume={folder.path}")
+        advice = ""
+        if _has_numbers(folder.checkpoints):
+            advice = f", or resume={folder.path}"
+        elif _ended_early(folder):
+            advice = ", or add resume=auto to begin here again"
+        raise UserError(f"{folder.path} is not empty: choose another run_dir{advice}")
 
 
 def check_nothing_to_lose(folder: RunFolder) -> None:
     """Raises UserError if the folder holds more than a run leaves that ended before its first checkpoint."""
-    if not _is_run(folder) or _has_numbers(folder.checkpoints) or _has_numbers(folder.best):
+    if not _ended_early(folder):
         check_empty(folder)
+
+
+def _ended_early(folder: RunFolder) -> bool:
+    """Whether a run of ours began there, and ended before its first checkpoint."""
+    return _is_run(folder) and not _has_numbers(folder.checkpoints) and not _has_numbers(folder.best)
 
 
 def has_checkpoints(folder: RunFolder) -> bool:

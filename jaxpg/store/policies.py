@@ -94,7 +94,8 @@ def load_several(
     if agent is None:
         agent = int(np.argmax(best.episode_return))
     if not 0 <= agent < config.num_agents:
-        raise UserError(f"agent={agent}: the run has agents 0 to {config.num_agents - 1}")
+        agents = f"agents 0 to {config.num_agents - 1}" if config.num_agents > 1 else "one agent, 0"
+        raise UserError(f"agent={agent}: the run has {agents}")
     policies: dict[str, tuple[Policy, int]] = {"best": (best.policy, update)}
     if "last" in kinds:
         policies["last"] = _restore(
