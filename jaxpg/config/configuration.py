@@ -144,7 +144,7 @@ def _describe_other_members(name: str, choices: Mapping[str, Any]) -> str | None
     if group not in ("algo", "network"):
         return None
     others = [member for member in GROUPS[group] if f"{group}.{leaf}" in find_option_fields({group: member})]
-    return (others and f"{group}={choices[group]} has no option {name}; {' or '.join(others)} has it") or None
+    return f"{group}={choices[group]} has no option {name}; {' or '.join(others)} has it" if others else None
 
 
 def to_yaml(config: Config) -> str:
