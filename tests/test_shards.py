@@ -143,7 +143,7 @@ def test_parts_on_devices_of_their_own_are_parts_on_one(name):
 
 
 def test_each_part_has_random_numbers_of_its_own():
-    both = shard(algorithm(None, 6, AXIS), 2, jax.devices())
+    both = shard(algorithm("td", 6, AXIS), 2, jax.devices())
     state = jax.jit(lambda key: initial_state(both, key))(jax.random.key(0))
     first, second = np.split(np.asarray(state.env_state.obs), 2)
     assert not np.isin(first[:, 0], second[:, 0]).any()

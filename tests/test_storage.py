@@ -64,7 +64,7 @@ def _flat(function, arguments):
 
 def test_other_text_is_no_program():
     text = to_text(trace(lambda x: jnp.sin(x), jnp.zeros(1)))
-    with pytest.raises(ValueError, match="sort is no operation"):
+    with pytest.raises(ValueError, match="sort is not an operation"):
         from_text(text.replace('"sin"', '"sort"'))
 
 
