@@ -123,7 +123,7 @@ from jaxpg.program import compile as program
 from jaxpg.commands.ending import run_command
 
 def main(arguments):
-    with program._compilers() as pool:
+    with program._compiler_pool() as pool:
         pool.submit(time.sleep, 600)  # as XLA does, which does not hear of signals
         print("compiling", flush=True)
         time.sleep(600)

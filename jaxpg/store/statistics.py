@@ -116,7 +116,7 @@ def bootstrap_interval(
         method="percentile",
         rng=seed,
     ).confidence_interval
-    return np.asarray(interval.low), np.asarray(interval.high)
+    return interval.low, interval.high
 
 
 def seed_interval(scores: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
