@@ -20,7 +20,6 @@ from jaxpg.nonfinite import skip_nonfinite, stop_at_nonfinite
 from jaxpg.policy import deterministic_policy
 from jaxpg.program.agents import Agents, list_agents, replace_values
 from jaxpg.program.algorithms import make_algorithm
-from jaxpg.program.allocator import trim_repeatedly
 from jaxpg.program.backend import OPTIMIZED, RUN_ONCE
 from jaxpg.program.mapping import count_parallel_groups, map_in_groups, map_over_agents
 from jaxpg.program.networks import make_networks
@@ -78,7 +77,7 @@ def compile_program(
     group = jax.tree.map(lambda x: x[:size], agents)
     traced = jax.jit(init).trace(group)
     shape = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype), traced.out_info)
-    with trim_repeatedly(), _compiler_pool() as pool:
+    with _compiler_pool() as pool:
         # Tracing holds Python's lock and compiling does not. So the functions are traced one after the other, starting
         # with the one that takes longest to compile.
         advance_future = pool.submit(jax.jit(advance).lower(group, shape.train, number=chunk).compile, OPTIMIZED)
