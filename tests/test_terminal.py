@@ -1,11 +1,14 @@
 """What is seen while a run goes on: on a terminal, and in a file."""
 
+import gc
 import io
 import os
 import re
 import subprocess
 import sys
+import threading
 import time
+import warnings
 
 import pytest
 from rich.console import Console
@@ -137,3 +140,17 @@ def test_without_a_process_to_filter_it_standard_error_is_as_it_was(monkeypatch,
     with filter_stderr():
         os.write(2, ALARM.encode())
     assert capfd.readouterr().err == ALARM
+
+
+def test_a_filter_that_ends_late_is_waited_for_in_the_background(monkeypatch):
+    """As on a busy machine, or while another process holds the pipe open: Python would warn that it still runs."""
+    monkeypatch.setattr(stderr, "PATIENCE", 0.05)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error", ResourceWarning)
+        with filter_stderr():
+            holder = subprocess.Popen([sys.executable, "-c", "input()"], stdin=subprocess.PIPE)  # inherits the pipe
+        gc.collect()
+        holder.communicate(b"\n")
+    for thread in [thread for thread in threading.enumerate() if thread.name.endswith("(wait)")]:
+        thread.join(60)
+        assert not thread.is_alive()

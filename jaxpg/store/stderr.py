@@ -11,6 +11,7 @@ import os
 import re
 import subprocess
 import sys
+import threading
 from collections.abc import Iterator
 
 # XLA's message for a program that it takes for another machine's; some CPUs do not recognise their own.
@@ -63,8 +64,10 @@ def _pipe_through_filter(result: FilterResult) -> Iterator[None]:
     finally:
         os.dup2(original, 2)  # closes the pipe's last writing end, so the process ends
         os.close(original)
-        with contextlib.suppress(subprocess.TimeoutExpired):
+        try:
             result.refused = process.wait(PATIENCE) == REFUSED
+        except subprocess.TimeoutExpired:  # a busy machine, or a process that holds the pipe open
+            threading.Thread(target=process.wait, daemon=True).start()
 
 
 def main() -> int:
