@@ -11,6 +11,7 @@ import jax.numpy as jnp
 from jaxpg import divergence, estimators, normalization
 from jaxpg.methods import Method
 from jaxpg.networks import Networks
+from jaxpg.policy import value_function
 from jaxpg.shapes import select
 from jaxpg.types import PyTree, Transition
 
@@ -60,10 +61,7 @@ def make_batch_fn(
         transition = neutralize(transition, counts, normalizer)
         obs = normalization.normalize(normalizer, transition.obs)
         value = networks.value(params["critic"], obs)
-
-        def value_fn(x):
-            return networks.value(params["critic"], normalization.normalize(normalizer, x))
-
+        value_fn = value_function(networks, params, normalizer)
         next_value = compute_next_values(value_fn, value, transition, episode_length)
         weight = jnp.where(counts, method.weight(transition), 0.0)
         scaled = transition._replace(reward=reward_scale * transition.reward)

@@ -5,7 +5,7 @@ Source: Schulman et al., Proximal policy optimization algorithms, arXiv 1707.063
 
 from __future__ import annotations
 
-import math
+import functools
 from typing import Any
 
 import jax
@@ -99,24 +99,23 @@ def minibatch_steps(
     """
     step = gradient_step(loss, optimizer, axis_name)
     num_steps = epochs * minibatches
-    kl_limit = math.inf if max_kl is None else max_kl
 
     def take_step(carry, numbered_minibatch):
         (params, opt_state, is_near), (number, minibatch) = carry, numbered_minibatch
         params, opt_state, metrics = step(params, opt_state, minibatch, number=number)
         return (params, opt_state, is_near), metrics | {"gradient_steps": jnp.ones(())}
 
-    def take_step_if_near(carry, numbered_minibatch):
+    def take_step_if_near(limit, carry, numbered_minibatch):
         def attempt():
             (params, opt_state, _), metrics = take_step(carry, numbered_minibatch)
-            is_near = metrics["kl"] <= kl_limit  # the KL divergence before the step
+            is_near = metrics["kl"] <= limit  # the KL divergence before the step
             selected = jax.tree.map(lambda new, old: jnp.where(is_near, new, old), (params, opt_state), carry[:2])
             return (*selected, is_near), jax.tree.map(lambda x: is_near * x, metrics)
 
         zeros = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), jax.eval_shape(attempt)[1])
         return jax.lax.cond(carry[2], attempt, lambda: (carry, zeros))
 
-    scan_step = take_step if max_kl is None else take_step_if_near
+    scan_step = take_step if max_kl is None else functools.partial(take_step_if_near, max_kl)
 
     def update(params, opt_state, batch, key, number: jax.Array | int = 0):
         def epoch(carry, numbers_and_key):

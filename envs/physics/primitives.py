@@ -54,16 +54,18 @@ def choose(index: Scalar, *cases: Scalar, dtype: np.dtype | None) -> Scalar:
 
 def maximum(x: Scalar, y: Scalar) -> Scalar:
     """max(x, y); max(-inf, x) = x."""
-    if is_constant(y):
-        x, y = y, x
-    return y if x is y or is_number(x, -math.inf) else build("max", x, y)
+    return _extremum("max", -math.inf, x, y)
 
 
 def minimum(x: Scalar, y: Scalar) -> Scalar:
     """min(x, y); min(inf, x) = x."""
+    return _extremum("min", math.inf, x, y)
+
+
+def _extremum(op: str, neutral: float, x: Scalar, y: Scalar) -> Scalar:
     if is_constant(y):
         x, y = y, x
-    return y if x is y or is_number(x, math.inf) else build("min", x, y)
+    return y if x is y or is_number(x, neutral) else build(op, x, y)
 
 
 def clamp(low: Scalar, x: Scalar, high: Scalar) -> Scalar:
@@ -73,20 +75,20 @@ def clamp(low: Scalar, x: Scalar, high: Scalar) -> Scalar:
 
 def logical_and(x: Scalar, y: Scalar) -> Scalar:
     """x and y, logical or bitwise; x and x = x."""
-    if is_constant(x):
-        x, y = y, x
-    if x is y or y is True:
-        return x
-    return False if y is False else build("and", x, y)
+    return _logical("and", True, x, y)
 
 
 def logical_or(x: Scalar, y: Scalar) -> Scalar:
     """x or y, logical or bitwise; x or x = x."""
+    return _logical("or", False, x, y)
+
+
+def _logical(op: str, neutral: bool, x: Scalar, y: Scalar) -> Scalar:
     if is_constant(x):
         x, y = y, x
-    if x is y or y is False:
+    if x is y or y is neutral:
         return x
-    return True if y is True else build("or", x, y)
+    return y if y is (not neutral) else build(op, x, y)
 
 
 def logical_not(x: Expression) -> Scalar:

@@ -23,9 +23,7 @@ class Checkpoints:
     """The checkpoints of one folder, by the number of updates made.
 
     Args:
-      folder: where they are or will be.
-      keep: how many of the newest are kept.
-      read_only: for whoever only looks: what is left of an unfinished save stays, as the run may be saving just now.
+      folder, keep, read_only: as in `OrbaxFolder`.
 
     Raises:
       CheckpointError: the folder cannot be made or read.

@@ -31,7 +31,7 @@ def record_duration(enabled: bool, what: str) -> Iterator[str]:
 
 
 def _in_words(seconds: Sequence[float]) -> str:
-    """The range of the durations, for the line of the terminal that counts them.
+    """The range of the durations, for the terminal.
 
     >>> _in_words([]), _in_words([2.04, 15.3]), _in_words([15.3, 15.3])
     ('for the first time here', '2.0 to 15.3 s here before', '15.3 s here before')
