@@ -42,7 +42,20 @@ def pack(elements: list, shape: tuple[int, ...]) -> Array:
     return array.reshape(shape)
 
 
-def choose_array(index: Expression, cases: Sequence[Array], aval) -> Array:
+def simplify_dtype(array: Array, dtype) -> Array:
+    """The array, numeric if no element depends on the data."""
+    array = np.asarray(array)
+    if array.dtype == object and not any(isinstance(x, Expression) for x in array.flat):
+        return array.astype(dtype)
+    return array
+
+
+def choose_array(index: Expression, cases: Sequence[Array], dtype) -> Array:
     """cases[index], with the index clamped to the valid range."""
     options = zip(*(as_objects(case).flat for case in cases), strict=True)
-    return pack([choose(index, *option, dtype=np.dtype(aval.dtype)) for option in options], aval.shape)
+    return pack([choose(index, *option, dtype=np.dtype(dtype)) for option in options], cases[0].shape)
+
+
+def find_dtype(array: Array) -> np.dtype:
+    """The dtype of the elements, of which one is an expression if the array is not numeric."""
+    return next(x.dtype for x in array.flat if isinstance(x, Expression)) if array.dtype == object else array.dtype

@@ -7,7 +7,9 @@ expression once: the same operation on the same operands returns the existing ex
 
 from __future__ import annotations
 
+import contextlib
 import math
+from collections.abc import Iterator
 from typing import TYPE_CHECKING, TypeGuard, Union
 
 import numpy as np
@@ -44,15 +46,29 @@ class Expression:
 
 
 class Graph:
-    """The expressions of one program, without duplicates."""
+    """The expressions of one program, without duplicates.
+
+    Attributes:
+      conditions: the results of what is traced now are used only if all of these are true.
+    """
 
     def __init__(self):
         self.size = 0
+        self.conditions: list[Scalar] = []
         self._known: dict[tuple, Expression] = {}
 
     def input(self, dtype: np.dtype) -> Expression:
         """A new input of the program."""
         return Expression(self, "input", (), (), np.dtype(dtype))
+
+    @contextlib.contextmanager
+    def suppose(self, condition: Scalar) -> Iterator[None]:
+        """Inside this context, what is traced is used only if the condition is true."""
+        self.conditions.append(condition)
+        try:
+            yield
+        finally:
+            self.conditions.pop()
 
     def expression(self, op: str, args: tuple, params: tuple, dtype: np.dtype) -> Expression:
         """The expression, without simplification."""

@@ -90,6 +90,7 @@ NUMPY: dict[str, Callable[..., Any]] = {
     "select_n": lambda which, off, on, *others: (
         np.choose(which, (off, on, *others)) if others else np.where(which, on, off)
     ),
+    "stop_gradient": lambda x: x,
     "convert_element_type": lambda x, new_dtype: x,
     "clamp": lambda low, x, high: np.minimum(np.maximum(x, low), high),
 }

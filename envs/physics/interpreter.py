@@ -3,12 +3,14 @@
 `scalarize(fn, *example_args)` traces `fn` to a jaxpr and interprets it once, with every array replaced by its
 elements: a number where the element is known, an `Expression` where it depends on the arguments. Slicing, gathering,
 padding and stacking then cost nothing, products with 0 vanish, small dot products, factorisations and fixed-length
-loops are written out, and unused results are dropped. XLA gets the rest as scalar operations, which under `vmap` are
+loops are written out, and unused results are dropped. Loops that run as long as the data say stay loops, of scalar
+equations (`envs.physics.loops`). XLA gets the rest as scalar operations, which under `vmap` are
 operations on contiguous vectors of the batch.
 """
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -16,11 +18,20 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from envs.physics.arrays import as_objects, choose_array, is_numeric, pack, promote
+from envs.physics.arrays import as_objects, choose_array, is_numeric, pack, promote, simplify_dtype
 from envs.physics.expressions import Expression, Graph
-from envs.physics.primitives import UnsupportedPrimitiveError
+from envs.physics.loops import trace_loop
+from envs.physics.primitives import UnsupportedPrimitiveError, choose
 from envs.physics.rules import RULES
-from envs.physics.stages import Stage, compile_separately, join_into_kernels, make_stages, run, sort_equations
+from envs.physics.stages import (
+    Stage,
+    compile_separately,
+    count_equations,
+    join_into_kernels,
+    make_stages,
+    run,
+    sort_equations,
+)
 
 
 def scalarize(fn: Callable, *example_args: Any) -> Callable:
@@ -35,8 +46,8 @@ def scalarize(fn: Callable, *example_args: Any) -> Callable:
       differentiated. Its attribute `program` is the `Program`.
 
     Raises:
-      UnsupportedPrimitiveError: `fn` has no scalar form, for example because the length of a loop or an index depends
-        on the data; the message names the primitive.
+      UnsupportedPrimitiveError: `fn` has no scalar form, for example because it sorts more elements than a network is
+        made for; the message names the primitive.
     """
     program = trace(fn, *example_args)
 
@@ -65,7 +76,7 @@ class Program:
     def __init__(self, inputs, outputs, output_dtypes, input_structure, output_structure):
         self.inputs, self.outputs, self.output_dtypes = inputs, outputs, output_dtypes
         self.input_structure, self.output_structure = input_structure, output_structure
-        self._results = [x for array in outputs for x in as_objects(array).flat]
+        self._results = _split_elements(outputs)
         self.stages = make_stages(self._output_expressions())
         self._split = compile_separately(_list_elements)
 
@@ -78,11 +89,11 @@ class Program:
         ]
 
     def __len__(self):
-        """The number of scalar equations."""
-        return len(self.equations())
+        """The number of scalar equations, with those of a loop's round counted once."""
+        return count_equations(self.equations())
 
     def equations(self) -> list[Expression]:
-        """The scalar equations, operands first."""
+        """The scalar equations, operands first, without those inside loops."""
         return sort_equations(self._output_expressions())
 
     def kernels(self) -> list[Stage]:
@@ -180,15 +191,7 @@ def interpret(equation, operands: list, wanted: list[bool]) -> list:
         raise UnsupportedPrimitiveError(f"{name}: no scalar rule")
     results = RULES[name](equation.outvars[0].aval, *operands, **params)
     results = results if isinstance(results, tuple) else (results,)
-    return [_simplify_dtype(result, var.aval.dtype) for result, var in zip(results, equation.outvars, strict=True)]
-
-
-def _simplify_dtype(array: np.ndarray, dtype) -> np.ndarray:
-    """The array, numeric if no element depends on the data."""
-    array = np.asarray(array)
-    if array.dtype == object and not any(isinstance(x, Expression) for x in array.flat):
-        return array.astype(dtype)
-    return array
+    return [simplify_dtype(result, var.aval.dtype) for result, var in zip(results, equation.outvars, strict=True)]
 
 
 # --- primitives that contain programs ---------------------------------------------------------------------------------
@@ -235,24 +238,62 @@ def _cond(operands, wanted, *, branches, **_):
     if is_numeric(which):
         branch = branches[int(np.clip(int(which), 0, len(branches) - 1))]
         return evaluate(branch.jaxpr, branch.consts, operands, wanted)
-    results = zip(*(evaluate(branch.jaxpr, branch.consts, operands, wanted) for branch in branches), strict=True)
+    index = which.item()
+    cases = []
+    for i, branch in enumerate(branches):
+        is_taken = choose(index, *(i == k for k in range(len(branches))), dtype=np.dtype(bool))
+        with index.graph.suppose(is_taken):
+            cases.append(evaluate(branch.jaxpr, branch.consts, operands, wanted))
     return [
-        choose_array(which.item(), cases, aval) if here else None
-        for cases, aval, here in zip(results, branches[0].out_avals, wanted, strict=True)
+        choose_array(index, options, aval.dtype) if here else None
+        for options, aval, here in zip(zip(*cases, strict=True), branches[0].out_avals, wanted, strict=True)
     ]
 
 
 def _while(operands, wanted, *, cond_nconsts, cond_jaxpr, body_nconsts, body_jaxpr):
-    """A loop with a known number of iterations; if it depends on the data there is no scalar form."""
-    cond_consts, body_consts = operands[:cond_nconsts], operands[cond_nconsts : cond_nconsts + body_nconsts]
-    carry = operands[cond_nconsts + body_nconsts :]
-    while True:
-        (continues,) = evaluate(cond_jaxpr.jaxpr, cond_jaxpr.consts, [*cond_consts, *carry])
-        if not is_numeric(continues):
-            raise UnsupportedPrimitiveError("while: the number of iterations depends on the data")
-        if not continues:
+    """Rounds that are known to happen are written out; from the first that depends on the data on, it is a `Loop`."""
+    consts, carry = operands[: cond_nconsts + body_nconsts], operands[cond_nconsts + body_nconsts :]
+
+    def advance(consts, carry):
+        return evaluate(body_jaxpr.jaxpr, body_jaxpr.consts, [*consts[cond_nconsts:], *carry])
+
+    def test(consts, carry):
+        return evaluate(cond_jaxpr.jaxpr, cond_jaxpr.consts, [*consts[:cond_nconsts], *carry])
+
+    while is_numeric(*(continues := test(consts, carry))):
+        if not continues[0]:
             return carry
-        carry = evaluate(body_jaxpr.jaxpr, body_jaxpr.consts, [*body_consts, *carry])
+        carry = advance(consts, carry)
+    return _loop(advance, test, consts, [*continues, *carry], [*cond_jaxpr.out_avals, *body_jaxpr.out_avals], wanted)
+
+
+def _loop(advance, test, consts, initial, avals, wanted):
+    """The carry after the rounds of a loop; `initial` and `avals` begin with the result of the test."""
+
+    def advance_elements(capture, elements):
+        inside = [x if is_numeric(x) else pack([capture(part) for part in x.flat], x.shape) for x in consts]
+        _, *carry = _join_elements(elements, avals)
+        carry = advance(inside, carry)
+        return _split_elements([*test(inside, carry), *carry])
+
+    dtypes = [np.dtype(aval.dtype) for aval in avals for _ in range(aval.size)]
+    wanted = [False, *wanted]
+    used = [here for aval, here in zip(avals, wanted, strict=True) for _ in range(aval.size)]
+    results = trace_loop(advance_elements, _split_elements(initial), dtypes, used)
+    _, *arrays = _join_elements(results, avals)
+    return [array if here else None for array, here in zip(arrays, wanted[1:], strict=True)]
+
+
+def _split_elements(arrays) -> list:
+    return [x for array in arrays for x in as_objects(np.asarray(array)).flat]
+
+
+def _join_elements(elements: list, avals) -> list[np.ndarray]:
+    """Arrays from their elements, in order."""
+    remaining = iter(elements)
+    return [
+        simplify_dtype(pack(list(itertools.islice(remaining, aval.size)), aval.shape), aval.dtype) for aval in avals
+    ]
 
 
 CONTROL = {

@@ -45,11 +45,17 @@ def select(which: Scalar, on_false: Scalar, on_true: Scalar, *others: Scalar, dt
 
 
 def choose(index: Scalar, *cases: Scalar, dtype: np.dtype | None) -> Scalar:
-    """cases[index], with the index clamped to the valid range."""
-    result = cases[0]
-    for at, case in enumerate(cases[1:], start=1):
-        result = select(apply("ge", index, at, dtype=np.dtype(bool)), result, case, dtype=dtype)
-    return result
+    """cases[index], with the index clamped to the valid range, by bisection of the runs of equal cases."""
+    starts = [i for i, case in enumerate(cases) if i == 0 or identity(case) != identity(cases[i - 1])]
+
+    def among(first: int, last: int) -> Scalar:
+        if first == last:
+            return cases[starts[first]]
+        middle = (first + last + 1) // 2
+        is_upper = apply("ge", index, starts[middle], dtype=np.dtype(bool))
+        return select(is_upper, among(first, middle - 1), among(middle, last), dtype=dtype)
+
+    return among(0, len(starts) - 1)
 
 
 def maximum(x: Scalar, y: Scalar) -> Scalar:
@@ -96,6 +102,11 @@ def logical_not(x: Expression) -> Scalar:
     return x.args[0] if x.op == "not" else build("not", x)
 
 
+def stop_gradient(x: Expression) -> Scalar:
+    """x without its derivatives, of which an integer has none."""
+    return x if x.op == "stop_gradient" or x.dtype.kind != "f" else build("stop_gradient", x)
+
+
 def convert(x: Expression, new_dtype: np.dtype) -> Scalar:
     """x converted to another dtype; unchanged if it has this dtype."""
     if x.dtype == new_dtype:
@@ -121,5 +132,6 @@ SIMPLIFY: dict[str, Callable[..., Any]] = {
     "and": logical_and,
     "or": logical_or,
     "not": logical_not,
+    "stop_gradient": stop_gradient,
     "convert_element_type": convert,
 }

@@ -11,22 +11,36 @@ is one contiguous vector of the batch.
 from __future__ import annotations
 
 from collections import Counter, defaultdict
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
 # Jax has no stable API for metadata yet. Without it stages compute the same but slower, as XLA inlines them.
 from jax.experimental.xla_metadata import set_xla_metadata
 
-from envs.physics.expressions import Expression
+from envs.physics.expressions import Expression, Scalar
+from envs.physics.loops import Loop, find_loop, is_result
 from envs.physics.trigonometry import sincos
 
 # Cost of computing a value, in additions.
-COST = {"sin": 12, "cos": 12, "div": 4, "sqrt": 4, "rsqrt": 8, "pow": 20, "exp": 10, "log": 10, "tanh": 12, "atan2": 30}
+COST = {
+    "sin": 12,
+    "cos": 12,
+    "div": 4,
+    "sqrt": 4,
+    "rsqrt": 8,
+    "pow": 20,
+    "exp": 10,
+    "log": 10,
+    "tanh": 12,
+    "atan2": 30,
+    "stop_gradient": 0,
+}
 # Cost of writing a value and reading it again. Measured with 1,024 environments: a two-link arm is fastest at 16, and a
 # fifth slower at 8 and 32; a seven-joint arm is equally fast from 0 to 11, and a fifth slower at 16.
 STORING = 10
@@ -41,29 +55,61 @@ KERNEL = 3000
 
 @dataclass(frozen=True)
 class Stage:
-    """Expressions that are computed from stored values and then stored, by `equations`, operands first."""
+    """Expressions that are computed from stored values and then stored, by `equations`, operands first.
+
+    The results of a loop are a stage of their own; `body` has the stages of one round.
+    """
 
     equations: list[Expression]
     inputs: list[Expression]
     outputs: list[Expression]
     run: Callable[..., list[jax.Array]]
+    body: Sequence[Stage] = ()
+
+    @property
+    def size(self) -> int:
+        """The number of equations, with those of a loop's round."""
+        return len(self.equations) + sum(stage.size for stage in self.body)
+
+    @property
+    def num_stored(self) -> int:
+        """The number of stored values, with those of a loop's round."""
+        return len(self.outputs) + sum(stage.num_stored for stage in self.body)
 
 
 def make_stages(outputs: Iterable[Expression]) -> list[Stage]:
     """The stages that compute the given expressions, in order."""
     wanted = list(outputs)
     equations = sort_equations(wanted)
+    wanted += [arg for expression in equations if is_result(expression) for arg in _operands(expression)]
     depth = _choose_stored(equations, {x.index for x in wanted})
-    by_depth = defaultdict(list)
+    groups = defaultdict(list)
     for expression in equations:
         if expression.index in depth:
-            by_depth[depth[expression.index]].append(expression)
-    return [_make_stage(by_depth[level], depth) for level in sorted(by_depth)]
+            loop = find_loop(expression)[0] if is_result(expression) else None
+            groups[depth[expression.index], loop].append(expression)
+    return [
+        _make_stage(groups[level, loop], depth) if loop is None else _make_loop(groups[level, loop], _make_body(loop))
+        for level, loop in sorted(groups, key=lambda key: key[0])
+    ]
 
 
 def sort_equations(outputs: Iterable[Expression]) -> list[Expression]:
     """All expressions that the outputs depend on, operands first, without the inputs of the program."""
     return _collect_operands(outputs, lambda expression: expression.op == "input")[0]
+
+
+def find_loops(equations: Iterable[Expression]) -> list[Loop]:
+    """The loops among the equations and inside these loops, innermost first."""
+    loops = dict.fromkeys(find_loop(x)[0] for x in equations if is_result(x))
+    found = [inner for loop in loops for inner in (*find_loops(sort_equations(loop.outputs())), loop)]
+    return list(dict.fromkeys(found))
+
+
+def count_equations(equations: Iterable[Expression]) -> int:
+    """The number of equations, with those of a loop's round counted once."""
+    equations = list(equations)
+    return len(equations) + sum(len(sort_equations(loop.outputs())) for loop in find_loops(equations))
 
 
 def _collect_operands(outputs: Iterable[Expression], is_given: Callable) -> tuple[list[Expression], list[Expression]]:
@@ -100,7 +146,8 @@ def _choose_stored(equations: list[Expression], wanted: set[int]) -> dict[int, i
         level = max((depth[arg.index] + (arg.index in stored) for arg in operands), default=0)
         depth[expression.index] = level
         cost = sum(COST.get(part.op, 1) for part in computed)
-        if expression.index in wanted or (uses[expression.index] - 1) * cost > STORING or cost > LARGEST:
+        is_costly = (uses[expression.index] - 1) * cost > STORING or cost > LARGEST
+        if expression.index in wanted or is_costly or is_result(expression):
             stored[expression.index] = level
         else:
             repeated[expression.index] = computed
@@ -114,6 +161,51 @@ def _make_stage(outputs: list[Expression], stored: dict[int, int]) -> Stage:
         return evaluate(equations, dict(zip((x.index for x in inputs), values, strict=True)), outputs)
 
     return Stage(equations, inputs, outputs, compile_separately(compute))
+
+
+def _make_body(loop: Loop) -> list[Stage]:
+    """The stages of one round."""
+    return make_stages(loop.outputs())
+
+
+def _make_loop(results: list[Expression], body: list[Stage]) -> Stage:
+    """A stage of results of one loop, with these stages of its rounds."""
+    loop, _ = find_loop(results[0])
+    operands = results[0].args
+    inputs = list({x.index: x for x in operands if isinstance(x, Expression)}.values())
+    places = [find_loop(x)[1] for x in results]
+
+    def compute(*values):
+        known = dict(zip((x.index for x in inputs), values, strict=True))
+        carry = _repeat(loop, body, _read(known, operands, [x.dtype for x in loop.carried + loop.captured]))
+        return [carry[place] for place in places]
+
+    return Stage(results, inputs, results, compile_separately(compute), body)
+
+
+def _repeat(loop: Loop, body: list[Stage], operands: list[jax.Array]) -> tuple[jax.Array, ...]:
+    """The carried values after the last round.
+
+    Whether there is another round is itself carried, as under `vmap` jax computes the condition twice in a round.
+    """
+    num_carried = len(loop.carried)
+    captured = dict(zip((x.index for x in loop.captured), operands[num_carried:], strict=True))
+    dtypes = [x.dtype for x in loop.carried]
+
+    def advance(carry):
+        values = captured | dict(zip((x.index for x in loop.carried), carry, strict=True))
+        run(body, values)
+        return tuple(_read(values, loop.following, dtypes))
+
+    return lax.while_loop(lambda carry: carry[0], advance, tuple(operands[:num_carried]))
+
+
+def _read(values: dict[int, Any], scalars: Iterable[Scalar], dtypes: Iterable[np.dtype]) -> list[jax.Array]:
+    """The values of expressions and constants."""
+    return [
+        values[x.index] if isinstance(x, Expression) else jnp.asarray(x, dtype)
+        for x, dtype in zip(scalars, dtypes, strict=True)
+    ]
 
 
 def compile_separately(function: Callable, **attributes: str) -> Callable:
@@ -150,18 +242,29 @@ def join_into_kernels(stages: list[Stage], outputs: Iterable[Expression]) -> lis
     groups: list[list[Stage]] = []
     room = 0
     for stage in stages:
-        if room < len(stage.equations):
+        if room < stage.size:
             groups.append([])
             room = KERNEL
         groups[-1].append(stage)
-        room -= len(stage.equations)
+        room -= stage.size
     used = {x.index for x in outputs}
     kernels = []
     for group in reversed(groups):
-        kernel = _join(group, used)
+        kernel = _split_loop(group[0]) if len(group) == 1 and is_large_loop(group[0]) else _join(group, used)
         used |= {x.index for x in kernel.inputs}
         kernels.append(kernel)
     return kernels[::-1]
+
+
+def is_large_loop(stage: Stage) -> bool:
+    """Whether the stage is a loop that is too large for one kernel."""
+    return bool(stage.body) and stage.size > KERNEL
+
+
+def _split_loop(stage: Stage) -> Stage:
+    """A loop around kernels, for one that is too large for a kernel."""
+    loop, _ = find_loop(stage.outputs[0])
+    return _make_loop(stage.outputs, join_into_kernels(list(stage.body), loop.outputs()))
 
 
 def _join(group: list[Stage], used: set[int]) -> Stage:

@@ -1,6 +1,6 @@
 """Stores programs of scalar equations as text, for later processes.
 
-Making the program of a model takes a second or more, mostly for importing MJX and tracing its step. Reading one takes
+Making the program of a model takes a second or more, mostly for importing MJX and tracing the step. Reading one takes
 milliseconds, and gives the same expressions. Without `use_store` every program is made anew.
 """
 
@@ -11,7 +11,7 @@ import functools
 import hashlib
 import importlib.metadata
 import json
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol
 
@@ -19,10 +19,12 @@ import jax
 import numpy as np
 
 from envs.physics.arrays import as_objects, pack
-from envs.physics.expressions import Expression, Graph
+from envs.physics.expressions import Expression, Graph, Scalar
 from envs.physics.folding import NUMPY
 from envs.physics.interpreter import Program
+from envs.physics.loops import Loop
 from envs.physics.models import model_digest
+from envs.physics.stages import find_loops, sort_equations
 
 if TYPE_CHECKING:
     import mujoco
@@ -63,10 +65,11 @@ def load_or_make(name: str, make: Callable[[], Program]) -> Program:
     return program
 
 
-def make_name(model: mujoco.MjModel, inputs: tuple[str, ...], outputs: tuple[str, ...]) -> str:
+def make_name(model: mujoco.MjModel, inputs: tuple[str, ...], outputs: tuple[str, ...], *options: object) -> str:
     """A name for the program of a model's step; programs that may differ have different names."""
     return hashlib.sha256(
-        model_digest(model) + repr((inputs, outputs, jax.config.values["jax_enable_x64"], *_list_versions())).encode()
+        model_digest(model)
+        + repr((inputs, outputs, options, jax.config.values["jax_enable_x64"], *_list_versions())).encode()
     ).hexdigest()
 
 
@@ -80,47 +83,66 @@ def _list_versions() -> tuple[str, ...]:
 
 # --- a program as JSON ------------------------------------------------------------------------------------------------
 # An element is a constant itself, or [i] for expression i. Expressions are in order of creation, which is also the
-# order of a program's equations.
+# order of a program's equations. A loop is a list of expressions of its own, by its number; those inside it come first.
 
 
 def to_text(program: Program) -> str:
     """The program as JSON; `from_text` is its inverse."""
+    loops = {loop: i for i, loop in enumerate(find_loops(program.equations()))}
     inputs = [x for array in program.inputs for x in array.flat]
-    expressions = sorted({x.index: x for x in (*inputs, *program.equations())}.values(), key=lambda x: x.index)
-    numbers = {x.index: i for i, x in enumerate(expressions)}
-
-    def element(x: Any) -> Any:
-        return [numbers[x.index]] if isinstance(x, Expression) else x
+    expressions, element = _encode_expressions([*inputs, *program.equations()], loops)
 
     def array(x: np.ndarray) -> list:
         return [list(x.shape), [element(part) for part in as_objects(x).flat]]
 
     content = {
-        "expressions": [
-            [x.op, [element(arg) for arg in x.args], _encode_params(x.params), x.dtype.name] for x in expressions
-        ],
+        "loops": [_encode_loop(loop, loops) for loop in loops],
+        "expressions": expressions,
         "inputs": [array(x) for x in program.inputs],
         "outputs": [[*array(x), dtype.name] for x, dtype in zip(program.outputs, program.output_dtypes, strict=True)],
     }
     return json.dumps(content)
 
 
+def _encode_loop(loop: Loop, loops: dict[Loop, int]) -> dict[str, list]:
+    expressions, element = _encode_expressions([*loop.carried, *loop.captured, *sort_equations(loop.outputs())], loops)
+    ends = {"carried": loop.carried, "captured": loop.captured, "following": loop.following}
+    return {"expressions": expressions, **{name: list(map(element, end)) for name, end in ends.items()}}
+
+
+def _encode_expressions(
+    expressions: Iterable[Expression], loops: dict[Loop, int]
+) -> tuple[list, Callable[[Scalar], Any]]:
+    """The expressions, and the function that encodes an element of an array of them."""
+    in_order = sorted({x.index: x for x in expressions}.values(), key=lambda x: x.index)
+    numbers = {x.index: i for i, x in enumerate(in_order)}
+
+    def element(x: Scalar) -> Any:
+        return [numbers[x.index]] if isinstance(x, Expression) else x
+
+    def parameter(value: Any) -> Any:
+        if isinstance(value, Loop):
+            return {"loop": loops[value]}
+        return {"dtype": value.name} if isinstance(value, np.dtype) else value
+
+    return [
+        [x.op, list(map(element, x.args)), [[name, parameter(value)] for name, value in x.params], x.dtype.name]
+        for x in in_order
+    ], element
+
+
 def from_text(text: str) -> Program:
     """The program in a text of `to_text`, as a function of one array per input."""
-    content, graph = json.loads(text), Graph()
-    expressions: list[Expression] = []
-
-    def element(x: Any) -> Any:
-        return expressions[x[0]] if isinstance(x, list) else x
+    content = json.loads(text)
+    loops: list[Loop] = []
+    for parts in content["loops"]:
+        element = _decode_expressions(parts.pop("expressions"), loops)
+        loops.append(Loop(**{name: tuple(map(element, end)) for name, end in parts.items()}))
+    element = _decode_expressions(content["expressions"], loops)
 
     def array(shape: list[int], elements: list) -> np.ndarray:
-        return pack([element(x) for x in elements], tuple(shape))
+        return pack(list(map(element, elements)), tuple(shape))
 
-    for op, operands, params, dtype in content["expressions"]:
-        if op != "input" and op not in NUMPY:
-            raise ValueError(f"{op} is not an operation of scalar equations")
-        args = tuple(map(element, operands))
-        expressions.append(Expression(graph, op, args, _decode_params(params), np.dtype(dtype)))
     outputs = [array(shape, elements) for shape, elements, _ in content["outputs"]]
     return Program(
         [array(*x) for x in content["inputs"]],
@@ -131,9 +153,23 @@ def from_text(text: str) -> Program:
     )
 
 
-def _encode_params(params: tuple) -> list:
-    return [[name, {"dtype": value.name} if isinstance(value, np.dtype) else value] for name, value in params]
+def _decode_expressions(content: list, loops: list[Loop]) -> Callable[[Any], Any]:
+    """The function that decodes an element of an array of the expressions."""
+    graph = Graph()
+    expressions: list[Expression] = []
 
+    def element(x: Any) -> Any:
+        return expressions[x[0]] if isinstance(x, list) else x
 
-def _decode_params(params: list) -> tuple:
-    return tuple((name, np.dtype(value["dtype"]) if isinstance(value, dict) else value) for name, value in params)
+    def parameter(value: Any) -> Any:
+        if isinstance(value, dict):
+            return loops[value["loop"]] if "loop" in value else np.dtype(value["dtype"])
+        return value
+
+    for op, operands, params, dtype in content:
+        if op not in ("input", "loop") and op not in NUMPY:
+            raise ValueError(f"{op} is not an operation of scalar equations")
+        args = tuple(map(element, operands))
+        named = tuple((name, parameter(value)) for name, value in params)
+        expressions.append(Expression(graph, op, args, named, np.dtype(dtype)))
+    return element

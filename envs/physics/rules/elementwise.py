@@ -28,4 +28,7 @@ def _hashable(parameter):
     return int(parameter) if hasattr(parameter, "value") else parameter  # enumerations by their number
 
 
-RULES = {name: functools.partial(_map_elements, name) for name in NUMPY}
+# `add_any` is the sum of cotangents.
+RULES = {name: functools.partial(_map_elements, name) for name in NUMPY} | {
+    "add_any": functools.partial(_map_elements, "add")
+}
