@@ -1,4 +1,4 @@
-"""Environments over MuJoCo MJX with brax's interface, made by name.
+"""Environments over MuJoCo with brax's interface, made by name.
 
     env = envs.make("pendulum", mass=2.0)
 

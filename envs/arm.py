@@ -52,7 +52,7 @@ class ArmConfig:
     success_radius: float = option(0.05, "distance that counts as reached [m]", above=0)
     dt: float = option(0.05, "time between two actions [s]", above=0, at_most=1)
     num_substeps: int = option(5, "physics steps between two actions", at_least=1)
-    physics: str = option("scalar", "MJX's step as scalar equations, MJX itself, or C MuJoCo", choices=tuple(PHYSICS))
+    physics: str = option("scalar", "MuJoCo's step as scalar equations, MJX, or C MuJoCo", choices=tuple(PHYSICS))
     episode_length: int = option(100, "steps until the time limit", at_least=1)
 
     def __post_init__(self):

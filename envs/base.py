@@ -108,9 +108,9 @@ class MjxEnv:
     Args:
       spec: the MuJoCo specification, with the environment's options applied.
       num_substeps: physics steps between two actions.
-      physics: how they are computed: "scalar" (scalar equations of MJX's step), "mjx" (that step itself) or "mujoco" (C
-        MuJoCo's step, which is never checked).
-      check: log differences between MJX and C MuJoCo (`envs.physics.check_model`), which takes a second or more. The
+      physics: how they are computed: "scalar" (C MuJoCo's step as scalar equations), "mjx" (MJX's step) or "mujoco" (C
+        MuJoCo's step itself, which is never checked).
+      check: log differences from C MuJoCo's motion (`envs.physics.check_model`), which takes a second or more. The
         shipped environments leave this to the tests.
     """
 

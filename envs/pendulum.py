@@ -1,4 +1,4 @@
-"""Swing up a torque-limited pendulum: Gymnasium's Pendulum-v1 as an MJX model.
+"""Swing up a torque-limited pendulum: Gymnasium's Pendulum-v1 as a MuJoCo model.
 
 A uniform rod of mass m and length l turns about one end; theta = 0 is upright (m l^2 / 3 about the pivot):
 
@@ -34,7 +34,7 @@ class PendulumConfig:
     torque_limit: float = option(2.0, "largest torque, reached at |action| = 1 [N m]", above=0)
     speed_limit: float = option(8.0, "angular speed is clipped to this [rad/s]", above=0)
     dt: float = option(0.05, "time between two actions, one physics step [s]", above=0, at_most=1)
-    physics: str = option("scalar", "MJX's step as scalar equations, MJX itself, or C MuJoCo", choices=tuple(PHYSICS))
+    physics: str = option("scalar", "MuJoCo's step as scalar equations, MJX, or C MuJoCo", choices=tuple(PHYSICS))
     episode_length: int = option(200, "steps until the time limit", at_least=1)
 
 

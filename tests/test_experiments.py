@@ -9,6 +9,7 @@ from pathlib import Path
 
 import gymnasium
 import jax
+import mujoco
 import numpy as np
 import pytest
 
@@ -130,6 +131,46 @@ def test_reinforce_and_td(experiments, monkeypatch):
     assert set(summary) == {"quadratic td", "quadratic reinforce"}
     assert all(curve["steps"] for curve in summary.values())
     assert (experiments / "reinforce_and_td.png").read_bytes().startswith(b"\x89PNG")
+
+
+CLAW = """<mujoco><default><geom type="capsule" fromto="0 0 0 .3 0 0" size=".02"/></default><worldbody>
+<body><joint name="a" axis="0 1 0"/><geom/></body><body pos="0 0 {}"><joint axis="0 1 0"/><geom/></body></worldbody>
+<option gravity="0 0 0"/><actuator><motor joint="a" ctrlrange="-1 1"/></actuator></mujoco>"""
+
+
+def share_that_touches(model, states, controls):
+    """The share of 200 steps after which C MuJoCo finds a contact; bounds of capsules are exact."""
+    counts = []
+    for qvel, ctrl in zip(states["qvel"], controls, strict=True):
+        data = mujoco.MjData(model)
+        data.qvel, data.ctrl = qvel, ctrl
+        for _ in range(200):
+            mujoco.mj_step(model, data)
+            mujoco.mj_kinematics(model, data)
+            mujoco.mj_collision(model, data)
+            counts.append(data.ncon > 0)
+    return np.mean(counts)
+
+
+def test_robots(experiments, monkeypatch):
+    import robots
+
+    monkeypatch.setattr(robots, "SECONDS", 0.01)
+    texts = {"near": CLAW.format(0.045), "far": CLAW.format(1), "none": "<mujoco/>", "broken": "<mujoco>"}
+    for name, text in texts.items():
+        (experiments / f"{name}.xml").write_text(text)
+    robots.main([f"robots={experiments}", "--envs", "4", "--steps", "200", "--rounds", "1"])
+    rows = {row["model"].split("/")[1]: row for row in json.loads((experiments / "robots.json").read_text())}
+    assert rows["none"]["error"]
+    assert rows["broken"]["error"]
+    assert (rows["near"]["watched"], rows["far"]["watched"]) == (1, 0)
+    model = mujoco.MjModel.from_xml_string(texts["near"])
+    for kind, share in robots.CONTROLS.items():
+        touching = share_that_touches(model, robots.make_states(model, 4), robots.make_controls(model, 4, share))
+        assert 0.05 < touching < 0.95
+        assert abs(rows["near"]["speeds"][kind]["left_to_c"] - touching) < 0.01
+    low, middle, high = rows["far"]["speeds"]["all"]["ours_over_C"]
+    assert 0 < low <= middle <= high
 
 
 @pytest.mark.study

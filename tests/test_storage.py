@@ -11,6 +11,7 @@ from test_scalarize import CASES
 
 import envs
 from envs.physics import step
+from envs.physics.dynamics.program import trace_step
 from envs.physics.interpreter import trace
 from envs.physics.storage import from_text, make_name, to_text, use_store
 from jaxpg.store import cache_folder, texts
@@ -29,15 +30,23 @@ def folder(monkeypatch, tmp_path):
 
 @pytest.fixture
 def made(monkeypatch):
-    """The models whose step was traced."""
-    models, make_single_step = [], step.make_single_step
+    """The models whose step was traced; a process keeps only its last program by itself, which is another one here."""
+    models = []
 
     def counted(model, *ends):
         models.append(model)
-        return make_single_step(model, *ends)
+        return trace_step(model, *ends)
 
-    monkeypatch.setattr(step, "make_single_step", counted)
+    monkeypatch.setattr("envs.physics.dynamics.program.trace_step", counted)
+    monkeypatch.setattr(step, "_latest", Forgetful())
     return models
+
+
+class Forgetful(dict):
+    """A memory that holds a program only until it is read."""
+
+    def __contains__(self, name):
+        return False
 
 
 def lowered(program):

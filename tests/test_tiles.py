@@ -138,7 +138,7 @@ def test_derivatives(tiled, plain, transform, inside):
 
 
 def test_several_kernels(plain, monkeypatch):
-    monkeypatch.setattr(stages, "KERNEL", 40)
+    monkeypatch.setattr(stages, "KERNEL", 10)
     step = compile_step(MODEL)
     agree(jax.jit(jax.vmap(step))(*states(300)), jax.jit(jax.vmap(plain))(*states(300)))
     assert len(kernels(step, 100)) >= 3  # of one tile; a loop over tiles jax 0.12 makes one kernel of, with all in it

@@ -36,7 +36,11 @@ DIVERGENCE_WARNINGS = ("mjWARN_BADQPOS", "mjWARN_BADQVEL", "mjWARN_BADQACC", "mj
 
 
 def make_callback_step(
-    model: mujoco.MjModel, num_substeps: int, inputs: tuple[str, ...], outputs: tuple[str, ...]
+    model: mujoco.MjModel,
+    num_substeps: int,
+    inputs: tuple[str, ...],
+    outputs: tuple[str, ...],
+    masked: bool = False,
 ) -> Callable[..., tuple[jax.Array, ...]]:
     """`num_substeps` times `mj_step` in double precision, as a function like those of `compile_step`.
 
@@ -46,12 +50,14 @@ def make_callback_step(
 
     Args:
       model, num_substeps, inputs, outputs: as in `compile_step`.
+      masked: the function has one more argument, after the inputs, and steps only those environments where it is not 0;
+        of the others it returns NaN.
 
     Raises:
       ValueError: an input is a field of the model that all environments of `mujoco.batch` share.
       MujocoModelError: `mujoco.batch` cannot step the model, for example because bodies may sleep.
     """
-    simulations = Simulations(model, num_substeps, inputs, outputs)
+    simulations = Simulations(model, num_substeps, inputs, outputs, masked)
 
     def fill(_, results, *arrays):
         simulations.step(list(map(np.asarray, arrays)), list(map(np.asarray, results)))
@@ -72,14 +78,21 @@ class Simulations:
     Calls share no state. Calls from several threads run one after the other, each on all cores.
     """
 
-    def __init__(self, model: mujoco.MjModel, num_substeps: int, inputs: Sequence[str], outputs: Sequence[str]):
+    def __init__(
+        self,
+        model: mujoco.MjModel,
+        num_substeps: int,
+        inputs: Sequence[str],
+        outputs: Sequence[str],
+        masked: bool = False,
+    ):
         import mujoco
 
         self._model = _separate_frames(
             copy.copy(model), [name.removeprefix(MODEL) for name in inputs if name.startswith(MODEL)]
         )
         self._model.opt.disableflags &= ~int(mujoco.mjtDisableBit.mjDSBL_AUTORESET)
-        self._num_substeps, self._inputs, self._outputs = num_substeps, inputs, outputs
+        self._num_substeps, self._inputs, self._outputs, self._masked = num_substeps, inputs, outputs, masked
         self._rank = len(find_types(model, inputs[:1])[0].shape)
         self._initial = _make_initial_state(self._model)
         self._batch = functools.lru_cache(maxsize=MAX_BATCHES)(self._make_batch)
@@ -109,9 +122,11 @@ class Simulations:
     def _step(self, batch: mujoco.batch.Batch, rows: list[np.ndarray], results: Sequence[np.ndarray]) -> None:
         batch.state[...] = self._initial
         batch.warning[...] = INITIAL_COUNT
-        for name, values in zip(self._inputs, rows, strict=True):
+        for name, values in zip(self._inputs, rows, strict=not self._masked):
             _get_field(batch, name)[...] = values
-        is_sound = np.all([_is_sound(name, values) for name, values in zip(self._inputs, rows, strict=True)], 0)
+        is_sound = np.all([_is_sound(*field) for field in zip(self._inputs, rows, strict=not self._masked)], 0)
+        if self._masked:
+            is_sound &= rows[-1][:, 0] != 0
         batch.step(is_sound, self._num_substeps)
         is_sound &= ~has_diverged(batch.warning[..., 1])
         for name, array in zip(self._outputs, results, strict=True):

@@ -6,17 +6,20 @@ Names are those of `mjx.Data` and `mjx.Model`; shapes are those of one environme
 from __future__ import annotations
 
 import difflib
-from collections.abc import Collection, Sequence
+from collections.abc import Callable, Collection, Sequence
 from typing import TYPE_CHECKING, Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
+from envs.physics.models import import_mjx
+
 if TYPE_CHECKING:
     import mujoco
 
 MODEL = "model."  # prefix of the fields of the model
+FLAG = "flag"  # of a step whose contacts are not all part of its equations
 STATE = ("qpos", "qvel", "act", "qacc_warmstart", "time")  # carried from one step to the next
 INPUTS = (*STATE, "ctrl", "qfrc_applied", "xfrc_applied", "eq_active", "mocap_pos", "mocap_quat")
 POSITIONS = ("xpos", "xquat", "xmat", "xipos", "ximat", "xanchor", "xaxis", "ten_length", "geom_xpos", "geom_xmat")
@@ -113,3 +116,44 @@ def _convert_argument(name: str, expected: jax.ShapeDtypeStruct, value: Any) -> 
     if not any(jnp.issubdtype(array.dtype, kind) for kind in kinds):
         raise TypeError(f"{name} has the dtype {array.dtype}; it must be {expected.dtype.name}, or integers")
     return array.astype(expected.dtype)
+
+
+# --- a step as a function of fields -----------------------------------------------------------------------------------
+
+
+def make_single_step(
+    mjx_model: Any, inputs: tuple[str, ...], outputs: tuple[str, ...], advance: Callable
+) -> tuple[Callable, list]:
+    """One physics step as a function from the named inputs to the named outputs, with example arguments.
+
+    Args:
+      mjx_model: an `mjx.Model`.
+      inputs, outputs: names as in `compile_step`.
+      advance: (mjx.Model, mjx.Data) -> mjx.Data after a step.
+    """
+    _check_model_fields(mjx_model, inputs)
+    initial = import_mjx().make_data(mjx_model)
+
+    def step(*arrays):
+        given = dict(zip(inputs, arrays, strict=True))
+        changed = {name.removeprefix(MODEL): x for name, x in given.items() if name.startswith(MODEL)}
+        data = initial.replace(**{name: x for name, x in given.items() if not name.startswith(MODEL)})
+        data = advance(mjx_model.tree_replace(changed), data)
+        return tuple(getattr(data, name) for name in outputs)
+
+    return step, [_get_field(mjx_model if name.startswith(MODEL) else initial, name) for name in inputs]
+
+
+def _check_model_fields(mjx_model, inputs: tuple[str, ...]) -> None:
+    """Raises ValueError for a field of the model that MJX treats as a constant."""
+    paths = [path for path, _ in jax.tree_util.tree_leaves_with_path(mjx_model)]
+    known = [MODEL + jax.tree_util.keystr(path, simple=True, separator=".") for path in paths]
+    for name in inputs:
+        if name.startswith(MODEL) and name not in known:
+            raise ValueError(f"MJX treats {name} as a constant: it cannot be an input")
+
+
+def _get_field(owner, name: str) -> jax.Array:
+    for part in name.removeprefix(MODEL).split("."):
+        owner = getattr(owner, part)
+    return jnp.asarray(owner)

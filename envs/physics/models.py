@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import copy
 import hashlib
 import io
 import os
@@ -10,6 +11,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
+
+from envs.physics.missing import leave_out_missing_files
 
 if TYPE_CHECKING:
     import mujoco
@@ -41,14 +44,19 @@ class MujocoModelError(ValueError):
 
 
 def load_spec(path: str | Path) -> mujoco.MjSpec:
-    """The editable specification in an MJCF file.
+    """The editable specification in an MJCF file, without the meshes whose files are missing.
+
+    One logged line says what was left out with the missing files (`missing.leave_out_missing_files`).
 
     Raises:
       MujocoModelError: the file is missing or is not MJCF; the message has the path and MuJoCo's message with the line.
+        Or a moving body has no inertia without a missing mesh.
     """
     mujoco = import_mujoco()
     try:
-        return mujoco.MjSpec.from_file(str(path))
+        spec = mujoco.MjSpec.from_file(str(path))
+        leave_out_missing_files(spec)
+        return spec
     except (ValueError, OSError) as error:
         raise MujocoModelError(f"{path}: {' '.join(str(error).split())}") from error
 
@@ -88,7 +96,51 @@ def model_digest(model: mujoco.MjModel) -> bytes:
 
 
 def put_model(model: mujoco.MjModel):
-    """The MJX model; raises MujocoModelError with the name of the feature that MJX does not support."""
+    """The MJX model from which `envs.physics.dynamics` takes its numbers: for motion without constraints.
+
+    What MJX looks at before it knows whether it needs it is taken from a copy of the model: shapes and collision (all
+    geoms become spheres that touch nothing), the cone, the solver, the integrator, flags, and the types of actuators,
+    equalities and sensors that it does not have. All numbers are those of the model. So types and flags are to be read
+    from the model itself, and `mjx.step` of this model is not its step.
+
+    Raises:
+      MujocoModelError: MJX refuses the model for something else, such as flexible bodies; the message has it.
+    """
+    import mujoco
+
+    prepared = copy.copy(model)
+    prepared.geom_type[:] = mujoco.mjtGeom.mjGEOM_SPHERE
+    prepared.geom_contype[:] = prepared.geom_conaffinity[:] = 0
+    for field, kind, types in _list_types():
+        values = getattr(prepared, field)
+        values[~np.isin(values, [int(each) for each in types])] = int(kind)
+    option, disable = prepared.opt, mujoco.mjtDisableBit
+    option.disableflags |= int(disable.mjDSBL_CONSTRAINT | disable.mjDSBL_CONTACT)
+    option.enableflags = 0
+    option.integrator = mujoco.mjtIntegrator.mjINT_EULER
+    option.cone = mujoco.mjtCone.mjCONE_PYRAMIDAL
+    option.solver = mujoco.mjtSolver.mjSOL_NEWTON
+    option.jacobian = mujoco.mjtJacobian.mjJAC_DENSE  # of which the mass matrix takes its form in MJX
+    option.noslip_iterations = 0
+    return _put_in_mjx(prepared)
+
+
+def _list_types():
+    """Fields of types that MJX looks at, with the type that stands for those that it lacks, and those it has."""
+    import mujoco
+
+    mjx = import_mjx()
+    yield "actuator_trntype", mujoco.mjtTrn.mjTRN_JOINT, mjx.TrnType
+    yield "actuator_dyntype", mujoco.mjtDyn.mjDYN_NONE, mjx.DynType
+    yield "actuator_gaintype", mujoco.mjtGain.mjGAIN_FIXED, mjx.GainType
+    yield "actuator_biastype", mujoco.mjtBias.mjBIAS_NONE, mjx.BiasType
+    yield "eq_type", mujoco.mjtEq.mjEQ_CONNECT, mjx.EqType
+    sensors = set(mjx.SensorType) - {mjx.SensorType.CONTACT}  # which MJX refuses by what they match
+    yield "sensor_type", mujoco.mjtSensor.mjSENS_CLOCK, sensors
+
+
+def put_whole_model(model: mujoco.MjModel):
+    """The model in MJX as it is, for `mjx.step`; raises MujocoModelError with the feature that MJX does not support."""
     import mujoco
 
     if not model.nmat and mujoco.mjtSensor.mjSENS_RANGEFINDER in model.sensor_type:
@@ -96,9 +148,13 @@ def put_model(model: mujoco.MjModel):
             f"{model_name(model)}: MJX cannot step it: rangefinder sensors in a model without a material; add "
             '<asset><material name="any"/></asset>'
         )
+    return _put_in_mjx(model)
+
+
+def _put_in_mjx(model: mujoco.MjModel):
     try:
         return import_mjx().put_model(model)
-    except (NotImplementedError, ValueError) as error:
+    except (NotImplementedError, ValueError, TypeError) as error:
         raise MujocoModelError(f"{model_name(model)}: MJX cannot step it: {error}") from error
 
 
@@ -134,4 +190,4 @@ def ignored_features(model: mujoco.MjModel) -> list[str]:
 def _has_constraints(model: mujoco.MjModel) -> bool:
     """Whether MJX makes constraint rows: equalities, friction loss, limits or possible contacts."""
     mjx = import_mjx()
-    return bool(mjx.make_data(put_model(model))._impl.efc_J.size)
+    return bool(mjx.make_data(put_whole_model(model))._impl.efc_J.size)

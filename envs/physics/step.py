@@ -1,13 +1,13 @@
 """One control step of a MuJoCo model, as a function of the few arrays that change.
 
-`compile_step` returns MJX's step as scalar equations (`envs.physics.interpreter`). A model without this form is stepped
-by `mjx.step` itself, and any model can be stepped by C MuJoCo (`envs.physics.callback`). Each is a function of one
-environment; use `jax.vmap` for batches.
+`compile_step` returns C MuJoCo's step (`envs.physics.dynamics`) as scalar equations (`envs.physics.interpreter`). A
+model without this form is stepped by C MuJoCo itself (`envs.physics.callback`), as is any model with
+`physics="mujoco"`, and by `mjx.step` only where it is asked for. Each is a function of one environment; use `jax.vmap`
+for batches.
 """
 
 from __future__ import annotations
 
-import copy
 import functools
 import logging
 from collections.abc import Callable, Sequence
@@ -17,10 +17,11 @@ import jax
 import jax.numpy as jnp
 
 from envs.physics.callback import make_callback_step
-from envs.physics.fields import MODEL, STATE, check_names, convert_arguments, find_types
-from envs.physics.interpreter import Program, trace
-from envs.physics.models import import_mjx, model_digest, model_name, put_model
-from envs.physics.obstacles import find_likely_obstacles, find_obstacles
+from envs.physics.collision import change_collision, describe_meshes
+from envs.physics.fields import FLAG, STATE, check_names, convert_arguments, find_types, make_single_step
+from envs.physics.interpreter import Program
+from envs.physics.models import MujocoModelError, import_mjx, model_digest, model_name, put_whole_model
+from envs.physics.pairs import has_constraints
 from envs.physics.primitives import UnsupportedPrimitiveError
 from envs.physics.stages import Stage
 from envs.physics.storage import load_or_make, make_name
@@ -31,8 +32,11 @@ if TYPE_CHECKING:
 
 logger = logging.getLogger(__name__)
 
+WARMSTART = "qacc_warmstart"
+
 StepFn = Callable[..., tuple[jax.Array, ...]]
 
+_latest: dict[str, Program] = {}  # the last program made, by its name: a check and its step need the same one
 _warned: set[bytes] = set()  # digests of the models that `_warn_once` has warned about
 
 
@@ -43,8 +47,9 @@ def compile_step(
     inputs: tuple[str, ...] = ("qpos", "qvel", "ctrl"),
     outputs: tuple[str, ...] = ("qpos", "qvel"),
     physics: str = "scalar",
+    collision: str | None = None,
 ) -> StepFn:
-    """`num_substeps` times `mjx.step`, with everything but the state held constant.
+    """`num_substeps` times C MuJoCo's step, with everything but the state held constant.
 
     Args:
       model: a compiled model.
@@ -56,8 +61,12 @@ def compile_step(
       outputs: the fields of `mjx.Data` (`fields.OUTPUTS`) that the step returns, in this order, after the last substep.
         As in MuJoCo, fields derived from the positions (xpos, site_xpos, sensordata, ...) belong to the state before
         that substep.
-      physics: "scalar": scalar equations, or for a model without this form `mjx.step`, with a warning that names the
-        feature; "mjx": `mjx.step`; "mujoco": C MuJoCo's step in double precision, which cannot be differentiated.
+      physics: "scalar": scalar equations, or for a model without this form C MuJoCo, with a warning that names the
+        feature, and for a step in which geoms may touch whose contacts have no equations C MuJoCo without one; "mjx":
+        `mjx.step`; "mujoco": C MuJoCo's step in double precision, which cannot be differentiated.
+      collision: which geoms collide: "all", "hull" (meshes as boxes and capsules around them), "primitives" (all but
+        meshes) or "none". By default, all of them with C MuJoCo and `mjx.step`, and with scalar equations all but
+        meshes, which one line says if there are such.
 
     Returns:
       A function of the inputs (SI units; ctrl in the actuators' units) of one environment, in jax's default precision.
@@ -67,14 +76,15 @@ def compile_step(
 
     Raises:
       ValueError: a name is unknown (with the nearest one), cannot be an input, or cannot differ between environments;
-        the inputs lack the activations of the model; or `physics` is unknown.
-      MujocoModelError: MJX cannot step the model.
+        the inputs lack the activations of the model; or `physics` or `collision` is unknown.
+      MujocoModelError: MJX cannot step the model, with "mjx", or `mujoco.batch` cannot.
     """
     if physics not in PHYSICS:
         raise ValueError(f"physics is {physics!r}; it must be one of {', '.join(PHYSICS)}")
     check_names(model, inputs, outputs)
-    carried = _find_carried(inputs)
-    results = carried + tuple(name for name in outputs if name not in carried)
+    results = _order_results(inputs, outputs)
+    if collision is not None:
+        model = change_collision(model, collision)
     compute = PHYSICS[physics](model, num_substeps, inputs, results)
 
     def step(*arrays):
@@ -88,26 +98,57 @@ def compile_step(
 def make_scalar_step(
     model: mujoco.MjModel, num_substeps: int, inputs: tuple[str, ...], outputs: tuple[str, ...]
 ) -> StepFn:
-    """The substeps as scalar equations, or for a model without this form as `mjx.step`, with a warning.
+    """The substeps as scalar equations, or for a model without this form by C MuJoCo, with a warning.
 
     Args:
       model, num_substeps, inputs: as in `compile_step`.
       outputs: the inputs that a step changes, in their order, followed by other outputs.
     """
+    colliding = change_collision(model, "primitives")
+    if num_substeps > 1 and WARMSTART not in inputs and has_constraints(colliding):
+        return _make_warm_step(model, num_substeps, inputs, outputs)
     try:
-        program = make_scalar_program(model, inputs, outputs)
-        carried = _find_carried(inputs)
-        return make_tiled(program, functools.partial(_make_program_step, program, inputs, carried, num_substeps))
-    except UnsupportedPrimitiveError as error:
-        _warn_once(model, "; ".join(find_likely_obstacles(model)) or str(error))
-    return make_mjx_step(_avoid_lapack(model), num_substeps, inputs, outputs)
+        program = make_scalar_program(colliding, inputs, outputs)
+    except (UnsupportedPrimitiveError, MujocoModelError) as error:
+        _warn_once(model, _describe_floor(_describe_reason(model, error)))
+        return make_callback_step(model, num_substeps, inputs, outputs)
+    if meshes := describe_meshes(model):
+        _warn_once(model, meshes)
+    make_function = functools.partial(_make_program_step, inputs, num_substeps)
+
+    def differentiable(*arrays):
+        derived = make_scalar_program(colliding, inputs, outputs, differentiable=True)
+        return make_function(derived, derived.stages)(*arrays)
+
+    is_watching = len(program.outputs) > len(outputs)
+    return make_tiled(
+        program,
+        functools.partial(make_function, program),
+        differentiable=differentiable,
+        replace=make_callback_step(colliding, num_substeps, inputs, outputs, masked=True) if is_watching else None,
+    )
+
+
+def _make_warm_step(
+    model: mujoco.MjModel, num_substeps: int, inputs: tuple[str, ...], outputs: tuple[str, ...]
+) -> StepFn:
+    """The step in which the solver of each substep may start from the acceleration of the last one."""
+    place = len(_find_carried(inputs))
+    extended = (*outputs[:place], WARMSTART, *outputs[place:])
+    step = make_scalar_step(model, num_substeps, (*inputs, WARMSTART), extended)
+
+    def start_cold(*arrays):
+        results = step(*arrays, jnp.zeros(model.nv))
+        return (*results[:place], *results[place + 1 :])
+
+    return start_cold
 
 
 def make_mjx_step(
     model: mujoco.MjModel, num_substeps: int, inputs: tuple[str, ...], outputs: tuple[str, ...]
 ) -> StepFn:
     """The substeps by `mjx.step`; arguments as in `make_scalar_step`."""
-    substep, _ = make_single_step(model, inputs, outputs)
+    substep, _ = make_single_step(put_whole_model(model), inputs, outputs, import_mjx().step)
 
     def step(*arrays):
         return _repeat(lambda values: substep(*values), inputs, _find_carried(inputs), num_substeps, arrays)
@@ -123,77 +164,99 @@ def _find_carried(inputs: tuple[str, ...]) -> tuple[str, ...]:
     return tuple(name for name in inputs if name in STATE)
 
 
-def make_scalar_program(model: mujoco.MjModel, inputs: tuple[str, ...], outputs: tuple[str, ...]) -> Program:
-    """One physics step as scalar equations; if they are in the store of `storage.use_store`, MJX is not even imported.
+def find_reason(model: mujoco.MjModel, inputs: tuple[str, ...], outputs: tuple[str, ...]) -> str:
+    """Why a step with these inputs and outputs has no scalar equations, in one line; empty if it has."""
+    try:
+        make_scalar_program(model, inputs, _order_results(inputs, outputs))
+    except (UnsupportedPrimitiveError, MujocoModelError) as error:
+        return _describe_reason(model, error)
+    return ""
+
+
+def _describe_reason(model: mujoco.MjModel, error: Exception) -> str:
+    return str(error).removeprefix(f"{model_name(model)}: ")
+
+
+def count_equations(model: mujoco.MjModel, inputs: tuple[str, ...], outputs: tuple[str, ...]) -> int:
+    """The number of scalar equations of one physics step; raises as `make_scalar_program`."""
+    return len(make_scalar_program(model, inputs, _order_results(inputs, outputs)))
+
+
+def _order_results(inputs: tuple[str, ...], outputs: tuple[str, ...]) -> tuple[str, ...]:
+    """The inputs that a step changes, in their order, followed by other outputs."""
+    carried = _find_carried(inputs)
+    return carried + tuple(name for name in outputs if name not in carried)
+
+
+def make_scalar_program(
+    model: mujoco.MjModel, inputs: tuple[str, ...], outputs: tuple[str, ...], differentiable: bool = False
+) -> Program:
+    """One physics step as scalar equations; if they are in the store of `storage.use_store`, nothing is traced.
+
+    Args:
+      model, inputs, outputs: as in `make_scalar_step`.
+      differentiable: as in `trace_step`.
 
     Raises:
-      UnsupportedPrimitiveError: the step has no such form.
+      UnsupportedPrimitiveError: the step has no such form, or a very long one.
+      MujocoModelError: MJX does not take the model.
     """
 
     def make():
-        obstacles = find_obstacles(model)
-        if obstacles and "qpos" in inputs and "qvel" in outputs:
-            raise UnsupportedPrimitiveError("; ".join(obstacles))
-        step, example = make_single_step(model, inputs, outputs)
-        return trace(step, *example)
+        from envs.physics.dynamics.program import trace_step  # loads mujoco
 
-    return load_or_make(make_name(model, inputs, outputs), make)
+        return trace_step(model, inputs, outputs, differentiable)
+
+    name = make_name(model, inputs, outputs, differentiable)
+    if name not in _latest:
+        program = load_or_make(name, make)
+        _latest.clear()
+        _latest[name] = program
+    return _latest[name]
 
 
-def _warn_once(model: mujoco.MjModel, reason: str) -> None:
-    """Warns, once for each model in this process, that it has no scalar equations, and says what to do."""
+def _describe_floor(reason: str) -> str:
+    return (
+        "it has no form as scalar equations and is stepped by C MuJoCo, at its speed and without gradients, because "
+        f"of: {reason}. See docs/physics.md"
+    )
+
+
+def _warn_once(model: mujoco.MjModel, line: str) -> None:
+    """Logs a line about how the model is stepped, once for each model in this process."""
     digest = model_digest(model)
     if digest not in _warned:
         _warned.add(digest)
-        logger.warning(
-            "%s has no form as scalar equations and is stepped by mjx.step, which takes long to compile and is slow on "
-            "a CPU (physics='mujoco' is faster there): %s. See docs/physics.md",
-            model_name(model),
-            reason,
+        logger.warning("%s: %s", model_name(model), line)
+
+
+def _make_program_step(inputs, num_substeps: int, program: Program, stages: list[Stage]) -> Callable:
+    """The substeps by scalar equations; elements are joined into arrays only at the end.
+
+    If the program has a flag as its last argument and result (`trace_step`), it is 0 in the beginning.
+    """
+    is_watching = len(program.inputs) > len(inputs)
+    names = [name for name, array in zip((*inputs, FLAG), program.inputs, strict=False) for _ in array.flat]
+    carried = (*_find_carried(inputs), FLAG)
+    num_carried = sum(name in carried for name in names)
+
+    def run(elements: list) -> list:
+        return (
+            _move(program.run(elements, stages), -1, num_carried - 1) if is_watching else program.run(elements, stages)
         )
 
-
-def make_single_step(model: mujoco.MjModel, inputs: tuple[str, ...], outputs: tuple[str, ...]) -> tuple[Callable, list]:
-    """`mjx.step` as a function from the named inputs to the named outputs, with example arguments."""
-    mjx = import_mjx()
-    mjx_model = put_model(model)
-    _check_model_fields(mjx_model, inputs)
-    initial = mjx.make_data(mjx_model)
-
     def step(*arrays):
-        given = dict(zip(inputs, arrays, strict=True))
-        changed = {name.removeprefix(MODEL): x for name, x in given.items() if name.startswith(MODEL)}
-        data = initial.replace(**{name: x for name, x in given.items() if not name.startswith(MODEL)})
-        data = mjx.step(mjx_model.tree_replace(changed), data)
-        return tuple(getattr(data, name) for name in outputs)
-
-    return step, [_get_field(mjx_model if name.startswith(MODEL) else initial, name) for name in inputs]
-
-
-def _check_model_fields(mjx_model, inputs: tuple[str, ...]) -> None:
-    """Raises ValueError for a field of the model that MJX treats as a constant."""
-    paths = [path for path, _ in jax.tree_util.tree_leaves_with_path(mjx_model)]
-    known = [MODEL + jax.tree_util.keystr(path, simple=True, separator=".") for path in paths]
-    for name in inputs:
-        if name.startswith(MODEL) and name not in known:
-            raise ValueError(f"MJX treats {name} as a constant: it cannot be an input")
-
-
-def _get_field(owner, name: str) -> jax.Array:
-    for part in name.removeprefix(MODEL).split("."):
-        owner = getattr(owner, part)
-    return jnp.asarray(owner)
-
-
-def _make_program_step(program: Program, inputs, carried, num_substeps: int, stages: list[Stage]) -> Callable:
-    """The substeps by scalar equations; elements are joined into arrays only at the end."""
-    names = [name for name, array in zip(inputs, program.inputs, strict=True) for _ in array.flat]
-
-    def step(*arrays):
-        elements = program.split(arrays)
-        return tuple(program.join(_repeat(lambda x: program.run(x, stages), names, carried, num_substeps, elements)))
+        elements = program.split((*arrays, jnp.zeros(())) if is_watching else arrays)
+        results = list(_repeat(run, names, carried, num_substeps, elements))
+        return tuple(program.join(_move(results, num_carried - 1, len(results) - 1) if is_watching else results))
 
     return step
+
+
+def _move(items: list, begin: int, end: int) -> list:
+    """The list with one item moved."""
+    item = items.pop(begin)
+    return [*items[:end], item, *items[end:]]
 
 
 def _repeat(function: Callable[[list], Sequence], names, carried, length: int, values: Sequence) -> tuple:
@@ -215,17 +278,3 @@ def _repeat(function: Callable[[list], Sequence], names, carried, length: int, v
         return (*state, *others)
     state, others = jax.lax.scan(substep, state, length=length)
     return (*state, *(other[-1] for other in others))
-
-
-def _avoid_lapack(model: mujoco.MjModel) -> mujoco.MjModel:
-    """The model with sparse matrices and the conjugate-gradient solver, for which MJX does not call LAPACK.
-
-    Some jaxlib releases hang when batched LAPACK calls fill their thread pool. Both solvers minimise the same convex
-    function.
-    """
-    import mujoco
-
-    model = copy.copy(model)
-    model.opt.jacobian = mujoco.mjtJacobian.mjJAC_SPARSE
-    model.opt.solver = mujoco.mjtSolver.mjSOL_CG
-    return model

@@ -49,7 +49,7 @@ def _check_same_structure(models: Sequence[mujoco.MjModel]) -> None:
 
 
 def _is_mjx_field(name: str) -> bool:
-    """Whether MJX has this field; its step does not use others, such as the tree of bounding boxes."""
+    """Whether MJX has this field; the equations do not use others, such as the tree of bounding boxes."""
     mjx, parts = import_mjx(), name.split(".")[1:]
     owner = mjx.Option if len(parts) == 2 else mjx.Model
     return parts[-1] in {field.name for field in dataclasses.fields(owner)}

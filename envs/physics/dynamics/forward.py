@@ -1,0 +1,148 @@
+"""C MuJoCo's `mj_forward` and `mj_step` for one environment, with the solver of the constraints handed in."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import TYPE_CHECKING
+
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+
+from envs.physics.dynamics.actuators import add_actuator_forces, is_idle
+from envs.physics.dynamics.codes import DISABLED, INTEGRATOR, WRAP
+from envs.physics.dynamics.forces import compensates_gravity, find_armature, find_passive_forces, is_disabled
+from envs.physics.dynamics.integrators import advance, find_coupled, find_integrated_acceleration, step_rk4
+from envs.physics.dynamics.kinematics import add_fields, find_jacobians, place_bodies
+from envs.physics.dynamics.linear_algebra import solve
+from envs.physics.dynamics.newton_euler import find_bias, find_mass_matrix, find_poses
+from envs.physics.dynamics.numbers import get_number, is_traced, is_zero
+from envs.physics.dynamics.rotations import contract
+from envs.physics.dynamics.sensors import read_sensors
+from envs.physics.dynamics.smooth import Smooth
+from envs.physics.dynamics.transmissions import find_tendon_rates, find_tendons, find_transmissions
+from envs.physics.dynamics.tree import make_tree
+
+if TYPE_CHECKING:
+    from mujoco import mjx
+
+# (model, mx, d, smooth) -> (qacc [nv], qfrc_constraint [nv])
+Solver = Callable[..., tuple]
+
+
+def unconstrained(model: mujoco.MjModel, mx: mjx.Model, d: mjx.Data, smooth: Smooth) -> tuple:
+    """The solution without constraints: (M^-1 qfrc_smooth, 0)."""
+    return d.qacc_smooth, jnp.zeros(model.nv)
+
+
+def forward(
+    model: mujoco.MjModel, mx: mjx.Model, d: mjx.Data, solve: Solver, sense: Callable | None = None, also=()
+) -> mjx.Data:
+    """Everything that follows from a state and controls, as by `mj_forward`.
+
+    Args:
+      model: the model.
+      mx: its numbers, some of which may be arguments of the traced function.
+      d: with time, qpos, qvel, act, ctrl, mocap poses and applied forces.
+      solve: (model, mx, d, smooth) -> (qacc [nv], qfrc_constraint [nv]), where d has the poses of all bodies, tendons,
+        qfrc_smooth and qacc_smooth; `unconstrained`, for example.
+      sense: (model, mx, d) -> {sensor: values}, the sensors that need constraints; see `read_sensors`.
+      also: names of fields to compute that no force needs: cdof, cvel, cam_xpos, cam_xmat.
+
+    Returns:
+      The data.
+    """
+    return evaluate(model, mx, d, solve, sense, also)[0]
+
+
+def step(
+    model: mujoco.MjModel, mx: mjx.Model, d: mjx.Data, solve: Solver, sense: Callable | None = None, also=()
+) -> mjx.Data:
+    """The data after one time step with the model's integrator, as by `mj_step`; arguments as of `forward`."""
+    return step_with_flag(model, mx, d, solve, sense, also)[0]
+
+
+def step_with_flag(
+    model, mx, d: mjx.Data, solve: Solver, sense: Callable | None = None, also=(), written_out: bool = True
+):
+    """The data after one time step, and the largest `Smooth.flag` of its evaluations.
+
+    Args:
+      model, mx, d, solve, sense, also: as of `forward`.
+      written_out: as of `step_rk4`.
+    """
+    if model.opt.integrator == INTEGRATOR.RK4:
+
+        def find_rates(stage):
+            stage, smooth = evaluate(model, mx, stage, solve, None, also, False)
+            return stage, smooth.flag
+
+        sensordata = evaluate(model, mx, d, solve, sense, also)[0].sensordata
+        d, flag = step_rk4(model, mx, d, find_rates, written_out)
+        return d.replace(sensordata=sensordata), flag
+    d, smooth = evaluate(model, mx, d, solve, sense, also)
+    return advance(model, mx, d, find_integrated_acceleration(model, mx, d, smooth), d.act_dot), smooth.flag
+
+
+def evaluate(
+    model, mx, d: mjx.Data, find_solution: Solver, sense: Callable | None = None, also=(), sensors: bool = True
+):
+    """The data of `forward`, and what the integrator needs besides."""
+    d, smooth = find_positions(model, mx, d)
+    d = add_fields(model, mx, d, smooth.tree, smooth.poses, also) if also else d
+    others, gravcomp = find_passive_forces(model, mx, d, smooth)
+    by_actuators = model.jnt_actgravcomp[model.dof_jntid].astype(bool)
+    passive, bias = others + jnp.where(by_actuators, 0.0, gravcomp), _find_bias(model, mx, d, smooth)
+    d = d.replace(qfrc_passive=jnp.asarray(passive), qfrc_gravcomp=jnp.asarray(gravcomp), qfrc_bias=bias)
+    d = add_actuator_forces(model, mx, d, smooth)
+    inner = passive - bias
+    if compensates_gravity(model, mx) and not by_actuators.any():  # fewer equations than the sum of both
+        inner = others - _find_bias(model, mx, d, smooth, compensated=True)
+    d = d.replace(qfrc_smooth=inner + d.qfrc_actuator + d.qfrc_applied + _find_applied(model, d))
+    d = d.replace(qacc_smooth=solve(smooth.mass, d.qfrc_smooth))
+    qacc, constraint = find_solution(model, mx, d, smooth)
+    d = d.replace(qacc=qacc, qfrc_constraint=constraint)
+    return (read_sensors(model, mx, d, smooth, sense) if sensors else d), smooth
+
+
+def find_positions(model: mujoco.MjModel, mx: mjx.Model, d: mjx.Data) -> tuple[mjx.Data, Smooth]:
+    """The data with poses and lengths, and the quantities between the state and the forces."""
+    tree = make_tree(model, mx, d)
+    poses = find_poses(tree, d.qpos, get_number(model, mx, "qpos0"))
+    d = place_bodies(model, mx, d, tree, poses)
+    mass = find_mass_matrix(tree, poses, model.nv) + find_armature(model, mx, "dof") * np.eye(model.nv)
+    J = np.zeros((0, model.nv))
+    if model.ntendon:
+        lengths, J = find_tendons(model, mx, d)
+        # `_impl.ten_J` is not public in MJX; constraints read it here, and tests/test_forces.py would miss it
+        d = d.replace(ten_length=lengths).tree_replace({"_impl.ten_J": jnp.asarray(J)})
+        armature = find_armature(model, mx, "tendon")
+        if not is_zero(armature):
+            mass = mass + jnp.where(find_coupled(model), contract(J.T * armature, J), 0.0)
+    moment = np.zeros((0, model.nv))
+    if model.nu:
+        lengths, moment = find_transmissions(model, mx, d, J)
+        d = d.replace(actuator_length=lengths)
+    speeds = contract(moment, d.qvel) * (0.0 if is_idle(model) else 1.0)
+    return d, Smooth(tree, poses, mass, J, contract(J, d.qvel), moment, speeds)
+
+
+def _find_bias(model, mx, d: mjx.Data, smooth: Smooth, compensated: bool = False):
+    """Coriolis, centrifugal and gravitational forces, with those of the tendons' armature [nv]."""
+    off = is_disabled(model, DISABLED.GRAVITY)
+    gravity = np.zeros(3) if off else get_number(model, mx, "opt.gravity")
+    bias = find_bias(smooth.tree, smooth.poses, d.qvel, gravity, compensated)
+    armature = find_armature(model, mx, "tendon")
+    if is_zero(armature) or not (model.wrap_type == WRAP.SITE).any():
+        return bias
+    rates = find_tendon_rates(model, d, smooth)
+    return bias + contract(armature * rates, smooth.tendon_jacobian)
+
+
+def _find_applied(model, d: mjx.Data):
+    """The forces and torques that are applied to the bodies' centres of mass, on the joints [nv]."""
+    if not is_traced(d.xfrc_applied) and is_zero(d.xfrc_applied):
+        return 0.0
+    J, J_r = find_jacobians(model, d, d.xipos, np.arange(model.nbody))
+    wrench = d.xfrc_applied[:, None, :]
+    return (J * wrench[..., :3] + J_r * wrench[..., 3:]).sum((0, 2))

@@ -1,0 +1,296 @@
+"""Pairs that are only watched: whoever may touch is stepped by C MuJoCo, and nobody else."""
+
+import functools
+import subprocess
+import sys
+from pathlib import Path
+
+import jax
+import mujoco
+import numpy as np
+import pytest
+from dynamics import mjx, prepare
+
+from envs.physics import compile_step
+from envs.physics.dynamics import forward
+from envs.physics.dynamics.choice import MOST_CONTACTS, choose_pairs, count_points
+from envs.physics.dynamics.watch import MANY_PAIRS, _list_solids, may_touch
+from envs.physics.interpreter import trace
+from envs.physics.numeric import evaluate
+from envs.physics.pairs import colliding_pairs
+
+SHAPES = {
+    "sphere": 'type="sphere" size="{0}"',
+    "capsule": 'type="capsule" size="{0} {1}"',
+    "ellipsoid": 'type="ellipsoid" size="{0} {1} {2}"',
+    "cylinder": 'type="cylinder" size="{0} {1}"',
+    "box": 'type="box" size="{0} {1} {2}"',
+    "mesh": 'type="mesh" mesh="wedge"',
+}
+MESH = '<asset><mesh name="wedge" vertex="0 0 0 .3 0 0 0 .2 0 0 0 .1 .1 .1 .2"/></asset>'
+
+
+def floating(geoms, floor=""):
+    """Bodies that float, each with these geoms."""
+    bodies = "".join(f"<body><freejoint/>{''.join(parts)}</body>" for parts in geoms)
+    return mujoco.MjModel.from_xml_string(f"<mujoco>{MESH}<worldbody>{floor}{bodies}</worldbody></mujoco>")
+
+
+def make_geom(shape, rng, margin=0.0):
+    numbers = rng.uniform(0.03, 0.25, 3)
+    place = f'pos="{" ".join(map(str, rng.uniform(-0.1, 0.1, 3)))}" quat="{" ".join(map(str, rng.normal(size=4)))}"'
+    return f'<geom {SHAPES[shape].format(*numbers)} {place} margin="{margin}" mass="1"/>'
+
+
+def compare(model, spread, number=1000, seed=0):
+    """(ours, true): whether the watched pairs may touch in random states, and whether they do in C MuJoCo."""
+    rng, data = np.random.default_rng(seed), mujoco.MjData(model)
+    mx = mjx.put_model(prepare(model))
+    start, pairs = mjx.make_data(mx), colliding_pairs(model)
+
+    def watch(qpos):
+        d, _ = forward.find_positions(model, mx, start.replace(qpos=qpos))
+        return may_touch(model, d, pairs)
+
+    qpos = rng.normal(size=(number, model.nbody - 1, 7))
+    qpos[:, :, :3] *= spread
+    qpos[:, :, 3:] /= np.linalg.norm(qpos[:, :, 3:], axis=2, keepdims=True)
+    qpos = qpos.reshape(number, -1)
+    (ours,) = evaluate(trace(watch, qpos[0]), [qpos])
+    true = np.zeros(number, bool)
+    for i in range(number):
+        data.qpos[:] = qpos[i]
+        mujoco.mj_fwdPosition(model, data)
+        true[i] = data.ncon > 0
+    return ours, true
+
+
+@pytest.fixture
+def in_float64():
+    with jax.enable_x64(True):
+        yield
+
+
+# --- whether they may touch -------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("margin", [0.0, 0.05])
+@pytest.mark.parametrize("shape", SHAPES)
+def test_what_touches_is_flagged(shape, margin, in_float64):
+    """Against all shapes. And the bounds are tight: of the flagged states more than a seventh touch."""
+    for seed, other in enumerate(SHAPES):
+        rng = np.random.default_rng(seed)
+        model = floating([[make_geom(shape, rng, margin)], [make_geom(other, rng)]])
+        ours, true = compare(model, 0.2, 300)
+        assert true.any()
+        assert not (true & ~ours).any()
+        assert (ours & true).sum() > 0.15 * ours.sum(), other
+        assert not ours.all()
+
+
+@pytest.mark.parametrize("shape", SHAPES)
+def test_what_touches_a_plane_is_flagged(shape, in_float64):
+    rng = np.random.default_rng(0)
+    plane = '<geom type="plane" size="1 1 1" pos="0 0 -.1" quat="1 .2 .3 0"/>'
+    ours, true = compare(floating([[make_geom(shape, rng)]], plane), 0.3, 300)
+    assert true.any()
+    assert not (true & ~ours).any()
+    assert (ours & ~true).sum() < (0.2 if shape == "mesh" else 0.02) * ours.sum()
+
+
+def test_bundles_of_a_body(in_float64):
+    """Of very many pairs a body's spheres and capsules are one capsule around them."""
+    rng = np.random.default_rng(0)
+    line = [f'<geom size=".05" pos="0 0 {0.07 * i}"/>' for i in range(6)]
+    line += [f'<geom type="capsule" size=".04 .1" pos=".03 0 {0.1 * i}" quat="1 .1 0 0"/>' for i in range(5)]
+    model = floating([line, line, [make_geom("box", rng), '<geom size=".05" pos=".4 0 0"/>']])
+    pairs = colliding_pairs(model)
+    assert len(pairs) > MANY_PAIRS
+    assert len(_list_solids(model, pairs)) < len(pairs) / 5
+    ours, true = compare(model, 0.5)
+    assert true.any()
+    assert not (true & ~ours).any()
+    assert not ours.all()
+    assert (ours & true).sum() > 0.3 * ours.sum()
+
+
+def test_what_is_far_is_not_flagged(in_float64):
+    rng = np.random.default_rng(0)
+    model = floating([[make_geom(shape, rng)] for shape in SHAPES])
+    ours, _ = compare(model, 30.0, 50)
+    assert ours.sum() < 3
+
+
+# --- which pairs are watched ------------------------------------------------------------------------------------------
+
+PLANE = '<geom name="floor" type="plane" size="5 5 1"/>'
+
+
+def arms(options="", floor="", more=""):
+    """Two arms of two links, which meet if they bend towards each other."""
+    arm = """<body name="{0}" pos="{1} 0 1"><joint axis="0 1 0" range="-3 3" damping=".1"/>
+      <geom type="capsule" fromto="0 0 0 0 0 .4" size=".04"/><body pos="0 0 .45"><joint axis="0 1 .1" range="-2 2"/>
+      <geom type="capsule" fromto="0 0 0 0 0 .3" size=".04"/></body></body>"""
+    text = f"""<mujoco model="two arms"><compiler autolimits="true" angle="radian"/><option timestep=".005" {options}/>
+    <worldbody>{floor}{arm.format("a", -0.4)}{arm.format("b", 0.4)}{more}</worldbody></mujoco>"""
+    return mujoco.MjModel.from_xml_string(text)
+
+
+def test_what_never_touches_by_itself_is_watched():
+    """And contacts with the floor are written out, as is what touches while nothing is commanded."""
+    model = arms(floor=PLANE, more='<body pos="2 0 .5"><freejoint/><geom size=".1"/></body>')
+    pairs = colliding_pairs(model)
+    chosen, watched = choose_pairs(model, pairs)
+    floor = model.geom("floor").id
+    assert {pair for pair in pairs if floor in (pair.geom1, pair.geom2)} == set(chosen)
+    assert set(chosen) | set(watched) == set(pairs)
+    assert not set(chosen) & set(watched)
+    assert len(watched) == 8
+    box = '<body pos="2 0 {}"><freejoint/><geom name="{}" type="box" size=".2 .2 .1"/></body>'
+    stacked = arms(floor=PLANE, more=box.format(0.1, "low") + box.format(0.299, "high"))
+    touching = {(stacked.geom("low").id, stacked.geom("high").id)}
+    assert touching <= {(pair.geom1, pair.geom2) for pair in choose_pairs(stacked, colliding_pairs(stacked))[0]}
+
+
+def test_contacts_are_bounded():
+    boxes = "".join(f'<body pos="{i} 0 .1"><freejoint/><geom type="box" size=".2 .2 .1"/></body>' for i in range(20))
+    model = arms(floor=PLANE, more=boxes)
+    chosen, watched = choose_pairs(model, colliding_pairs(model))
+    assert 0 < count_points(model, chosen) <= MOST_CONTACTS
+    assert len(chosen) + len(watched) == len(colliding_pairs(model))
+
+
+def test_varying_shapes_cannot_be_watched():
+    model = arms()
+    pairs = colliding_pairs(model)
+    assert choose_pairs(model, pairs, ("geom_size",)) == (pairs, [])
+
+
+# --- steps ------------------------------------------------------------------------------------------------------------
+
+SUBSTEPS = 3
+
+
+def draw_states(number=200, seed=0):
+    rng = np.random.default_rng(seed)
+    return rng.uniform(-1, 1, (number, 4)).astype(np.float32), rng.uniform(-3, 3, (number, 4)).astype(np.float32)
+
+
+@functools.cache
+def make_step(physics="scalar", substeps=SUBSTEPS):
+    step = compile_step(arms(), substeps, inputs=("qpos", "qvel"), physics=physics)
+    return step, jax.jit(jax.vmap(step))
+
+
+@functools.cache
+def step_by_mujoco(seed=0):
+    """(qpos, qvel, touched): by C MuJoCo's loop, with whether there was a contact in one of the substeps."""
+    model, results = arms(), []
+    data = mujoco.MjData(model)
+    for qpos, qvel in zip(*draw_states(seed=seed), strict=True):
+        mujoco.mj_resetData(model, data)
+        data.qpos[:], data.qvel[:], touched = qpos, qvel, False
+        for _ in range(SUBSTEPS):
+            mujoco.mj_step(model, data)
+            touched |= data.ncon > 0
+        results.append((data.qpos.copy(), data.qvel.copy(), touched))
+    return tuple(map(np.array, zip(*results, strict=True)))
+
+
+def close(ours, true):
+    for mine, other in zip(ours, true, strict=True):
+        np.testing.assert_allclose(mine, other, rtol=1e-3, atol=1e-3)
+
+
+def test_everyone_is_stepped_as_by_mujoco():
+    qpos, qvel, touched = step_by_mujoco()
+    assert 10 < touched.sum() < 150
+    ours = make_step()[1](*draw_states())
+    close(ours, (qpos, qvel))
+    floor = make_step("mujoco")[1](*draw_states())
+    for mine, other in zip(ours, floor, strict=True):  # those that touch come from C MuJoCo itself, to the bit
+        np.testing.assert_array_equal(mine[touched], other[touched])
+    same = np.all([(np.asarray(mine) == other).all(1) for mine, other in zip(ours, floor, strict=True)], 0)
+    assert 0 < (~same).sum() <= (~touched).sum()  # the others by the equations
+
+
+def test_environments_do_not_influence_each_other():
+    """In another order, and among others that are far from touching."""
+    states = draw_states()
+    together, order = make_step()[1](*states), np.random.default_rng(1).permutation(200)
+    moved = make_step()[1](*(x[order] for x in states))
+    for mine, other in zip(together, moved, strict=True):
+        np.testing.assert_array_equal(np.asarray(mine)[order], other)
+    single = make_step()[0]
+    for place in (0, 1, np.flatnonzero(step_by_mujoco()[2])[0]):
+        close(jax.jit(single)(*(x[place] for x in states)), [x[place] for x in together])
+
+
+def test_a_nan_stays_in_its_environment():
+    states = draw_states()
+    sound = make_step()[1](*states)
+    touched = np.flatnonzero(step_by_mujoco()[2])[0]
+    for place in (touched, np.flatnonzero(~step_by_mujoco()[2])[0]):
+        bad = [x.copy() for x in states]
+        bad[0][place, 1] = np.nan
+        results = [np.asarray(x) for x in make_step()[1](*bad)]
+        assert all(np.isnan(x[place]).any() for x in results)
+        for mine, other in zip(results, sound, strict=True):
+            np.testing.assert_array_equal(np.delete(mine, place, 0), np.delete(other, place, 0))
+
+
+def test_inside_scans_and_several_maps():
+    step, batched = make_step()
+    qpos, qvel = draw_states()
+    expected = batched(*batched(qpos, qvel))
+
+    @jax.jit
+    def play(state):
+        return jax.lax.scan(lambda state, _: (batched(*state), None), state, length=2)[0]
+
+    close(play((qpos, qvel)), expected)
+    split = [x.reshape(4, 50, 4) for x in (qpos, qvel)]
+    folded = jax.jit(jax.vmap(jax.vmap(step)))(*split)
+    close([x.reshape(200, 4) for x in folded], batched(qpos, qvel))
+
+
+def test_derivatives_where_nothing_touches():
+    """Against differences of the step in float64, as if the arms could not touch."""
+    qpos, qvel = (x[~step_by_mujoco()[2]][:3] for x in draw_states())
+    with jax.enable_x64(True):
+        step = compile_step(arms(), 1, inputs=("qpos", "qvel"))
+        derivative = jax.jit(jax.vmap(jax.jacfwd(lambda *x: step(*x)[1], (0, 1))))(
+            qpos.astype(float), qvel.astype(float)
+        )
+        jit = jax.jit(jax.vmap(step))
+        for argument, mine in enumerate(derivative):
+            for i, e in enumerate(1e-6 * np.eye(4)):
+                ahead, back = ([qpos.astype(float), qvel.astype(float)] for _ in range(2))
+                ahead[argument], back[argument] = ahead[argument] + e, back[argument] - e
+                true = (jit(*ahead)[1] - jit(*back)[1]) / 2e-6
+                np.testing.assert_allclose(mine[:, :, i], true, rtol=1e-4, atol=1e-4)
+
+
+DEVICES = """
+import jax, jax.numpy as jnp, numpy as np, sys
+jax.config.update("jax_num_cpu_devices", 2)
+sys.path.insert(0, {folder!r})
+from test_watch import arms, draw_states
+from envs.physics import compile_step
+step = jax.vmap(compile_step(arms(), 3, inputs=("qpos", "qvel")))
+mesh = jax.sharding.Mesh(jax.devices(), ("shards",))
+def play(state):
+    return jax.lax.scan(lambda state, _: (tuple(step(*state)), None), state, length=20)[0]
+where = jax.sharding.PartitionSpec("shards")
+state = tuple(jnp.tile(x, (200, 1)) for x in draw_states())
+shards = jax.jit(jax.shard_map(play, mesh=mesh, in_specs=where, out_specs=where, check_vma=False))
+one, other = shards(state), shards(state)
+print(all(np.array_equal(a, b) for a, b in zip(one, other)), np.isfinite(one[0]).all())
+"""
+
+
+def test_two_devices():
+    """40,000 environments, twenty steps: ends, with the same bits."""
+    code = DEVICES.format(folder=str(Path(__file__).parent))
+    ended = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=200, check=False)
+    assert ended.stdout == "True True\n", ended.stderr
