@@ -1,10 +1,10 @@
-"""Claim: MJX models step at the speed of hand-written equations, and many times faster than C MuJoCo on all cores.
+"""Claim: models step at the speed of hand-written equations, and many times faster than C MuJoCo on all cores.
 
     python experiments/physics_throughput.py [--envs 1 64 1024 16384] [--repeats 7] [--models pendulum arm ...]
 
 For a pendulum, a two-link arm and a seven-joint arm with and without joint limits, physics steps per second of
 
-    scalar   scalar equations made of MJX's step (envs.physics.compile_step), batched by vmap
+    scalar   C MuJoCo's step as scalar equations (envs.physics.compile_step), batched by vmap, on one core
     mjx      vmap(mjx.step); of the seven-joint arm with few environments only, as it makes a few dozen steps a second
     hand     the pendulum's equation of motion, written down, batched by vmap
     mujoco   C MuJoCo's step called from the compiled program, one call for each step of all environments, on all cores
