@@ -4,11 +4,12 @@ import copy
 
 import mujoco
 import numpy as np
-from dynamics import mjx, prepare
+from dynamics import mjx
 
 from envs.physics.dynamics import forward
 from envs.physics.dynamics.constrained import make_solver
 from envs.physics.interpreter import trace
+from envs.physics.models import put_model
 from envs.physics.numeric import evaluate
 from envs.physics.pairs import colliding_pairs
 
@@ -20,7 +21,7 @@ FIELDS = ("qpos", "qvel", "ctrl", "act", "mocap_pos", "mocap_quat")
 
 def make_program(model, states, results, name="forward", pairs=None):
     """Our equations for `results`, as a function of C MuJoCo's data: those of `forward.forward` or `forward.step`."""
-    mx = mjx.put_model(prepare(model))
+    mx = put_model(model)
     start = mjx.make_data(mx)
     solve = make_solver(colliding_pairs(model) if pairs is None else pairs)
 

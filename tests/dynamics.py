@@ -1,13 +1,11 @@
 """States of small models stepped by `envs.physics.dynamics` and by C MuJoCo."""
 
-import copy
-
 import mujoco
 import numpy as np
 
 from envs.physics.dynamics import forward
 from envs.physics.interpreter import trace
-from envs.physics.models import import_mjx
+from envs.physics.models import import_mjx, put_model
 from envs.physics.numeric import evaluate
 
 mjx = import_mjx()
@@ -65,22 +63,9 @@ def compile_unconstrained(text):
     return model
 
 
-def prepare(model):
-    """A copy that MJX takes: spheres without collisions, no constraints, Euler's method."""
-    model = copy.copy(model)
-    model.geom_type[:] = mujoco.mjtGeom.mjGEOM_SPHERE
-    model.geom_contype[:] = model.geom_conaffinity[:] = 0
-    model.sensor_type[:] = mujoco.mjtSensor.mjSENS_CLOCK
-    model.actuator_trntype[:] = mujoco.mjtTrn.mjTRN_TENDON
-    model.opt.solver = mujoco.mjtSolver.mjSOL_NEWTON
-    model.opt.cone, model.opt.integrator = mujoco.mjtCone.mjCONE_PYRAMIDAL, mujoco.mjtIntegrator.mjINT_EULER
-    model.opt.disableflags |= FLAG.mjDSBL_CONSTRAINT | FLAG.mjDSBL_CONTACT
-    return model
-
-
 def make_function(model, results, name="step"):
     """(qpos, qvel, act, ctrl, **others) -> results, by `forward.step` or `forward.forward`."""
-    mx = mjx.put_model(prepare(model))
+    mx = put_model(model)
     start = mjx.make_data(mx)
 
     def function(qpos, qvel, act, ctrl, **others):

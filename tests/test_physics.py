@@ -8,6 +8,7 @@ import models
 import mujoco
 import numpy as np
 import pytest
+from constrained import converge
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -57,13 +58,6 @@ def test_single_steps_in_float32(name):
         np.testing.assert_allclose(mine / size, true / size, rtol=0, atol=tolerance)
 
 
-def converged(model):
-    """The model with a solver of C MuJoCo that ends at the solution, as the equations do."""
-    model.opt.solver, model.opt.iterations, model.opt.ls_iterations = mujoco.mjtSolver.mjSOL_NEWTON, 100, 100
-    model.opt.tolerance, model.opt.ls_tolerance = 0, 1e-12
-    return model
-
-
 @pytest.mark.parametrize("name", models.CONSTRAINED)
 def test_constrained_steps_are_those_of_a_converged_solver(name):
     """Limits, friction loss, equalities, contacts: C MuJoCo's to 1e-9 of the largest velocity, in float64.
@@ -74,7 +68,7 @@ def test_constrained_steps_are_those_of_a_converged_solver(name):
         model = models.make(name)
         states = models.random_states(model, 100)
         ours = jax.jit(jax.vmap(compile_step(model)))(*map(jnp.asarray, states))
-        for mine, true in zip(ours, models.by_mujoco(converged(model), states), strict=True):
+        for mine, true in zip(ours, models.by_mujoco(converge(model), states), strict=True):
             np.testing.assert_allclose(mine, true, rtol=0, atol=1e-9 * max(1.0, np.abs(true).max()))
 
 

@@ -9,6 +9,7 @@ from dynamics import BODIES, TENDONS, compile_unconstrained, draw_state, make_fu
 
 from envs.physics.dynamics import forward
 from envs.physics.interpreter import trace
+from envs.physics.models import put_model
 
 ACTUATORS = """<actuator><motor name="m" joint="j1" gear="3"/><position joint="j1" kp="3"/><motor tendon="t1"/>
 <motor tendon="t2"/></actuator>"""
@@ -89,7 +90,7 @@ def test_sensors_of_constraints_are_handed_in():
     model = compile_unconstrained(
         write_mjcf(extra='<sensor><touch site="s3" cutoff="2"/><force site="s4"/><force site="s4"/></sensor>')
     )
-    mx = dynamics.mjx.put_model(dynamics.prepare(model))
+    mx = put_model(model)
     force = np.zeros((model.nbody, 3))
     force[-1, 2] = 5.0
 

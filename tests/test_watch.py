@@ -9,13 +9,14 @@ import jax
 import mujoco
 import numpy as np
 import pytest
-from dynamics import mjx, prepare
+from dynamics import mjx
 
 from envs.physics import compile_step
 from envs.physics.dynamics import forward
 from envs.physics.dynamics.choice import MOST_CONTACTS, choose_pairs, count_points
 from envs.physics.dynamics.watch import MANY_PAIRS, _list_solids, may_touch
 from envs.physics.interpreter import trace
+from envs.physics.models import put_model
 from envs.physics.numeric import evaluate
 from envs.physics.pairs import colliding_pairs
 
@@ -45,7 +46,7 @@ def make_geom(shape, rng, margin=0.0):
 def compare(model, spread, number=1000, seed=0):
     """(ours, true): whether the watched pairs may touch in random states, and whether they do in C MuJoCo."""
     rng, data = np.random.default_rng(seed), mujoco.MjData(model)
-    mx = mjx.put_model(prepare(model))
+    mx = put_model(model)
     start, pairs = mjx.make_data(mx), colliding_pairs(model)
 
     def watch(qpos):

@@ -19,6 +19,9 @@ GEOMETRY = ("body_pos", "body_quat", "jnt_pos", "jnt_axis", "jnt_range", "qpos0"
 GEOMETRY += ("geom_pos", "geom_quat", "geom_size", "geom_rbound", "geom_aabb", "geom_margin", "pair_margin")
 
 
+SHAPES = ("plane", "hfield", "sphere", "capsule", "ellipsoid", "cylinder", "box", "mesh", "sdf")  # as mjtGeom
+
+
 @dataclasses.dataclass(frozen=True)
 class Pair:
     """Two geoms that may touch, ordered as in MuJoCo's contacts: by type, then as the rules list them.
@@ -70,6 +73,11 @@ def colliding_pairs(model: mujoco.MjModel) -> list[Pair]:
         if frozenset((first, second)) not in known:
             pairs.append(Pair(*_sort(model, first, second), -1, _find_condim(model, first, second)))
     return pairs
+
+
+def get_shapes(model: mujoco.MjModel, pair: Pair) -> tuple[str, str]:
+    """The names of the shapes of a pair's geoms."""
+    return SHAPES[model.geom_type[pair.geom1]], SHAPES[model.geom_type[pair.geom2]]
 
 
 def has_constraints(model: mujoco.MjModel) -> bool:

@@ -8,9 +8,8 @@ from collections.abc import Collection, Sequence
 import mujoco
 import numpy as np
 
-from envs.physics.dynamics.contacts import get_shapes
 from envs.physics.dynamics.shapes import DEEPEST_ONLY, NUM_CONTACTS
-from envs.physics.pairs import Pair
+from envs.physics.pairs import Pair, get_shapes
 from envs.physics.primitives import UnsupportedPrimitiveError
 
 MOST_CONTACTS = 32  # points of contact that the equations of a step may have

@@ -27,13 +27,10 @@ from envs.physics.dynamics.numbers import get_number
 from envs.physics.dynamics.rotations import cross_each
 from envs.physics.dynamics.shapes import PAIRS, Shape
 from envs.physics.dynamics.sums import BodySums
+from envs.physics.pairs import Pair, get_shapes
 
 if TYPE_CHECKING:
     from mujoco import mjx
-
-    from envs.physics.pairs import Pair
-
-SHAPES = ("plane", "hfield", "sphere", "capsule", "ellipsoid", "cylinder", "box", "mesh", "sdf")  # as mjtGeom
 
 
 class Contact(NamedTuple):
@@ -73,11 +70,6 @@ def find_contacts(model: mujoco.MjModel, mx: mjx.Model, d: mjx.Data, pairs: Sequ
     for (condim, *shapes), group in groups.items():
         found.setdefault(condim, []).append(_collide(model, mx, d, tuple(shapes), group))
     return {condim: _concatenate(parts) for condim, parts in sorted(found.items())}
-
-
-def get_shapes(model: mujoco.MjModel, pair: Pair) -> tuple[str, str]:
-    """The names of the two shapes of a pair, as in `envs.physics.dynamics.shapes`."""
-    return SHAPES[model.geom_type[pair.geom1]], SHAPES[model.geom_type[pair.geom2]]
 
 
 def _collide(model, mx, d, shapes: tuple[str, str], pairs: list[Pair]) -> Contact:

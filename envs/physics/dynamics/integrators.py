@@ -221,17 +221,10 @@ def _repeat_stages(proceed: Callable, state, is_lost):
 
     def body(carry):
         i, state = carry
-        after = proceed(_choose(i, RK4_SHARES), _choose(i, RK4_WEIGHTS), state)
+        after = proceed(jnp.array(RK4_SHARES)[i], jnp.array(RK4_WEIGHTS)[i], state)
         return i + 1, jax.tree.map(lambda new, old: jnp.asarray(new, old.dtype), after, state)
 
     def goes_on(carry):
         return carry[0] < len(RK4_SHARES) + is_lost
 
     return jax.lax.while_loop(goes_on, body, (jnp.zeros((), int), jax.tree.map(jnp.asarray, state)))[1]
-
-
-def _choose(index, numbers: tuple[float, ...]):
-    result = jnp.asarray(numbers[-1])
-    for i, number in reversed(list(enumerate(numbers[:-1]))):
-        result = jnp.where(index == i, number, result)
-    return result

@@ -9,6 +9,8 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 
+from envs.physics.dynamics.kinematics import find_carriers
+
 
 class BodySums:
     """The tree of a model's bodies, whose root is the world.
@@ -24,10 +26,9 @@ class BodySums:
         depth = np.zeros(model.nbody, int)
         self.has = np.zeros((model.nbody, model.nv))
         self.has[model.dof_bodyid, np.arange(model.nv)] = 1.0
-        self.moves = self.has.copy()
+        self.moves = find_carriers(model).astype(float)
         for body in range(1, model.nbody):
             depth[body] = depth[self.parent[body]] + 1
-            self.moves[body] += self.moves[self.parent[body]]
         self.levels = [np.flatnonzero(depth == level) for level in range(depth.max() + 1)]
 
     @functools.cached_property

@@ -32,6 +32,7 @@ from envs.physics.dynamics.rotations import (
 )
 from envs.physics.dynamics.smooth import Smooth
 from envs.physics.dynamics.tree import BALL, FREE
+from envs.physics.features import wraps_around_geoms
 
 if TYPE_CHECKING:
     from mujoco import mjx
@@ -66,11 +67,6 @@ def find_tendons(model: mujoco.MjModel, mx: mjx.Model, d: mjx.Data):
         result.append((contract(weight, lengths), contract(weight, rows)))
     lengths, rows = zip(*result, strict=True)
     return jnp.stack(lengths), jnp.stack(rows) if is_traced(*rows) else np.stack(rows)
-
-
-def wraps_around_geoms(model: mujoco.MjModel) -> bool:
-    """Whether a tendon goes around a sphere or a cylinder."""
-    return bool(np.isin(model.wrap_type, (WRAP.SPHERE, WRAP.CYLINDER)).any())
 
 
 def _find_wrapped(mx: mjx.Model, d: mjx.Data, model):

@@ -6,7 +6,7 @@ import mujoco
 import numpy as np
 
 from envs.physics.dynamics.codes import BIAS, DYNAMICS, GAIN, INTEGRATOR, SENSOR, TRANSMISSION
-from envs.physics.dynamics.transmissions import wraps_around_geoms
+from envs.physics.features import wraps_around_geoms
 
 ACTUATORS = {
     "adhesion actuators": ("trntype", (TRANSMISSION.BODY,)),

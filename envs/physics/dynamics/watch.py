@@ -18,9 +18,8 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 
-from envs.physics.dynamics.contacts import SHAPES
 from envs.physics.dynamics.rotations import rotate_each
-from envs.physics.pairs import Pair, find_margin
+from envs.physics.pairs import SHAPES, Pair, find_margin
 from envs.physics.reach import enclose_geoms
 
 if TYPE_CHECKING:
@@ -70,7 +69,8 @@ def may_touch(model: mujoco.MjModel, d: mjx.Data, pairs: Sequence[Pair]) -> jax.
 
 def _list_solids(model, pairs: Sequence[Pair]) -> list[tuple[Solid, Solid, float]]:
     """The pairs as solids with their margins; of very many pairs, a body's spheres and capsules become one."""
-    solids = {geom: _make_solid(model, geom) for pair in pairs for geom in (pair.geom1, pair.geom2)}
+    capsules = enclose_geoms(model)
+    solids = {geom: _make_solid(model, geom, capsules) for pair in pairs for geom in (pair.geom1, pair.geom2)}
     bundles, is_many = dict(solids), len(pairs) > MANY_PAIRS
     for body in {solid.body for solid in solids.values()}:
         round_ones = [g for g, solid in solids.items() if solid.body == body and solid.shape in ("sphere", "capsule")]
@@ -88,8 +88,9 @@ def _list_solids(model, pairs: Sequence[Pair]) -> list[tuple[Solid, Solid, float
     return [(*solids, margins[key]) for key, solids in found.items()]
 
 
-def _make_solid(model, geom: int) -> Solid:
-    centre, axis, radius = (x[geom] for x in enclose_geoms(model))
+def _make_solid(model, geom: int, capsules: tuple[np.ndarray, ...]) -> Solid:
+    """A geom, with its capsule of those of `enclose_geoms`."""
+    centre, axis, radius = (x[geom] for x in capsules)
     axes = np.empty(9)
     mujoco.mju_quat2Mat(axes, model.geom_quat[geom])
     axes, shape = axes.reshape(3, 3), SHAPES[model.geom_type[geom]]
