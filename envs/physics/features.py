@@ -7,43 +7,28 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from envs.physics.pairs import colliding_pairs, get_shapes
+from envs.physics.pairs import SHAPES, colliding_pairs, get_shapes
 
 if TYPE_CHECKING:
     import mujoco
 
 # Fields of mjModel with a feature that is not simulated, if one of their values is not 0, and what it is called. First
-# those of joints, tendons and actuators,
-JOINT_FIELDS = {
-    "jnt_stiffnesspoly": "higher stiffness coefficients of joints",
-    "dof_dampingpoly": "higher damping coefficients of joints",
-    "tendon_stiffnesspoly": "higher stiffness coefficients of tendons",
-    "tendon_dampingpoly": "higher damping coefficients of tendons",
-    "actuator_delay": "delay of actuators",
-    "actuator_damping": "damping of actuators",
-    "actuator_armature": "armature of actuators",
-}
-OTHER_FIELDS = {
-    "nflex": "flexible bodies (<flex>)",
-    "nplugin": "plugins",
-    "actuator_dampingpoly": "higher damping coefficients of actuators",
-}
+# those of bodies and actuators,
+FIELDS = {"nflex": "flexible bodies (<flex>)", "nplugin": "plugins", "actuator_delay": "delay of actuators"}
 # those of sensors, which matter only where `sensordata` is an output,
 SENSOR_FIELDS = {"sensor_delay": "delay of sensors", "sensor_interval": "sampling interval of sensors"}
-SENSORS = ("TOUCH", "CONTACT", "RANGEFINDER", "INSIDESITE", "GEOMDIST", "GEOMNORMAL", "GEOMFROMTO", "TACTILE", "PLUGIN")
-SENSORS += tuple(f"{kind}LIMIT{what}" for kind in ("JOINT", "TENDON") for what in ("POS", "VEL", "FRC"))
-FORCE_SENSORS = ("FORCE", "TORQUE")  # which leave out contacts, points that are held, and tendons around geoms
+SENSORS = ("GEOMDIST", "GEOMNORMAL", "GEOMFROMTO", "TACTILE", "PLUGIN")
+FORCE_SENSORS = ("FORCE", "TORQUE")  # which leave out tendons around geoms
+CONTACT_SIZES = (1, 3, 3, 1, 3, 3, 3)  # numbers of the values of a contact, as mjtConDataField
 # and those of contacts.
 CONTACT_FIELDS = {
     "geom_surfacevel": "surface velocity of geoms",
     "geom_adhesion": "adhesion of geoms",
-    "geom_gap": "gap of geoms",
     "pair_adhesion": "adhesion of contact pairs",
-    "pair_gap": "gap of contact pairs",
 }
 # Fields of types of actuators, with MuJoCo's enumeration and the simulated values.
 ACTUATOR_TYPES = {
-    "actuator_trntype": ("mjtTrn", "transmission", ("JOINT", "JOINTINPARENT", "TENDON", "SITE")),
+    "actuator_trntype": ("mjtTrn", "transmission", ("JOINT", "JOINTINPARENT", "TENDON", "SITE", "SLIDERCRANK")),
     "actuator_dyntype": ("mjtDyn", "dynamics", ("NONE", "INTEGRATOR", "FILTER", "FILTEREXACT", "MUSCLE")),
     "actuator_gaintype": ("mjtGain", "gain", ("FIXED", "AFFINE", "MUSCLE")),
     "actuator_biastype": ("mjtBias", "bias", ("NONE", "AFFINE", "MUSCLE")),
@@ -67,23 +52,64 @@ def list_smooth_features(model: mujoco.MjModel, outputs: Collection[str]) -> lis
     """Those of the motion without constraints, and of sensors."""
     import mujoco
 
-    fields = OTHER_FIELDS | JOINT_FIELDS | (SENSOR_FIELDS if "sensordata" in outputs else {})
+    sensors = _find_sensors(model, outputs)
+    fields = FIELDS | (SENSOR_FIELDS if sensors.size else {})
     features = _list_fields(model, fields)
     for field, (kind, name, supported) in ACTUATOR_TYPES.items():
         found = {getattr(mujoco, kind)(int(x)).name.split("_", 1)[1] for x in getattr(model, field)} - set(supported)
         features += [f"actuators with the {name} type {', '.join(sorted(found)).lower()}"] if found else []
-    return [*features, *_list_options(model), *(_list_sensors(model) if "sensordata" in outputs else [])]
+    pulls = any(name.split("[")[0] == "cfrc_ext" for name in outputs) and wraps_around_geoms(model)
+    features += ["cfrc_ext with tendons around geoms"] if pulls else []
+    return [*features, *_list_options(model), *_list_sensors(model, sensors)]
 
 
-def _list_sensors(model: mujoco.MjModel) -> list[str]:
-    """One phrase about the sensors that are not simulated; those of forces, if more acts on bodies than they know."""
+def _find_sensors(model: mujoco.MjModel, outputs: Collection[str]) -> np.ndarray:
+    """The numbers of the sensors that are wanted, as "sensordata" or "sensordata[name]"."""
     import mujoco
 
-    rigid = int(mujoco.mjtEq.mjEQ_CONNECT), int(mujoco.mjtEq.mjEQ_WELD)
-    is_held = np.isin(model.eq_type, rigid).any() or colliding_pairs(model) or wraps_around_geoms(model)
-    names = (mujoco.mjtSensor(int(kind)).name.removeprefix("mjSENS_") for kind in model.sensor_type)
-    found = sorted({name.lower() for name in names if name in SENSORS or (is_held and name in FORCE_SENSORS)})
+    names = [name[len("sensordata[") : -1] for name in outputs if name.startswith("sensordata[")]
+    if "sensordata" in outputs:
+        return np.arange(model.nsensor)
+    return np.array([mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_SENSOR, name) for name in names], int)
+
+
+def _list_sensors(model: mujoco.MjModel, sensors: np.ndarray) -> list[str]:
+    """One phrase about those of these sensors that are not simulated."""
+    import mujoco
+
+    names = {int(i): mujoco.mjtSensor(int(model.sensor_type[i])).name.removeprefix("mjSENS_") for i in sensors}
+    found = sorted({name.lower() for i, name in names.items() if _is_unread(model, i, name)})
     return [f"sensors of type {', '.join(found)}"] if found else []
+
+
+def _is_unread(model: mujoco.MjModel, sensor: int, name: str) -> bool:
+    """Whether a sensor of this type needs C MuJoCo."""
+    if name in FORCE_SENSORS:
+        return wraps_around_geoms(model)
+    if name == "RANGEFINDER":
+        return _sees_too_much(model, sensor)
+    return name in SENSORS or (name == "CONTACT" and not _is_ordered(model, sensor))
+
+
+def _sees_too_much(model: mujoco.MjModel, sensor: int) -> bool:
+    """Whether a rangefinder sees shapes that are not simple, or has more values than the distance."""
+    import mujoco
+
+    is_plain = model.sensor_objtype[sensor] == mujoco.mjtObj.mjOBJ_SITE and model.sensor_dim[sensor] == 1
+    is_distance = model.sensor_intprm[sensor, 0] == 1 << int(mujoco.mjtRayDataField.mjRAYDATA_DIST)
+    complex_shapes = [SHAPES.index(name) for name in ("hfield", "mesh", "sdf")]
+    return not (is_plain and is_distance) or bool(np.isin(model.geom_type, complex_shapes).any())
+
+
+def _is_ordered(model: mujoco.MjModel, sensor: int) -> bool:
+    """Whether the values of a contact sensor do not depend on the order in which C MuJoCo finds contacts."""
+    data, reduce = model.sensor_intprm[sensor, :2]
+    if model.geom_gap.any() or model.pair_gap.any():
+        return False  # contacts that are found and do not act
+    slots = sum(size for place, size in enumerate(CONTACT_SIZES) if data >> place & 1)
+    if data >> len(CONTACT_SIZES):
+        return False
+    return data == 1 or reduce == 3 or (reduce in (1, 2) and model.sensor_dim[sensor] == slots)
 
 
 def _list_fields(model: mujoco.MjModel, fields: dict[str, str]) -> list[str]:
@@ -98,8 +124,6 @@ def _list_options(model: mujoco.MjModel) -> Iterator[str]:
         yield 'the integrator "discrete"'
     if option.enableflags & int(mujoco.mjtEnableBit.mjENBL_SLEEP):
         yield "sleeping islands"
-    if any(0 <= group < 31 and option.disableactuator >> group & 1 for group in model.actuator_group.tolist()):
-        yield "disabled groups of actuators"
     if wraps_around_geoms(model) and model.tendon_armature.any():
         yield "armature of tendons around geoms"
     if model.nu != len(model.actuator_trntype):
@@ -130,7 +154,6 @@ def list_constraint_features(model: mujoco.MjModel) -> list[str]:
     checks = {
         "noslip iterations of the solver": option.noslip_iterations and has_friction,
         "the flag diagexact": option.enableflags & int(flags.mjENBL_DIAGEXACT),
-        "the flag override": option.enableflags & int(flags.mjENBL_OVERRIDE) and pairs,
         f"equality constraints of type {', '.join(sorted(kinds)).lower()}": kinds,
         **{f"contacts of {name}": shape in shapes for shape, name in UNSUPPORTED_SHAPES.items()},
     }

@@ -10,8 +10,10 @@ operations on contiguous vectors of the batch.
 
 from __future__ import annotations
 
+import contextlib
+import gc
 import itertools
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
 import jax
@@ -29,6 +31,7 @@ from envs.physics.stages import (
     count_equations,
     join_into_kernels,
     make_stages,
+    read,
     run,
     sort_equations,
 )
@@ -78,7 +81,7 @@ class Program:
         self.input_structure, self.output_structure = input_structure, output_structure
         self._results = _split_elements(outputs)
         self.stages = make_stages(self._output_expressions())
-        self._split = compile_separately(_list_elements)
+        self._split = compile_separately(self._list_elements)
 
     @property
     def results(self) -> list[jax.ShapeDtypeStruct]:
@@ -104,33 +107,48 @@ class Program:
         return [x for x in self._results if isinstance(x, Expression)]
 
     def split(self, leaves: Sequence) -> list[jax.Array]:
-        """The elements of the arguments' leaves, in order."""
+        """The elements of the leaves, in order; where these have a batch axis in front, vectors of the batch."""
         return self._split(*leaves)
+
+    def _list_elements(self, *leaves):
+        pairs = zip(self.inputs, leaves, strict=True)
+        return [leaf[(..., *place)] for symbols, leaf in pairs for place in np.ndindex(*symbols.shape)]
 
     def run(self, elements: list[jax.Array], stages: list[Stage] | None = None) -> list[jax.Array]:
         """The elements of the result's leaves, computed by the program's stages or by those given."""
         values = dict(zip((x.index for array in self.inputs for x in array.flat), elements, strict=True))
         run(self.stages if stages is None else stages, values)
-        dtypes = (dtype for array, dtype in zip(self.outputs, self.output_dtypes, strict=True) for _ in array.flat)
-        return [
-            values[x.index] if isinstance(x, Expression) else jnp.asarray(x, dtype)
-            for x, dtype in zip(self._results, dtypes, strict=True)
-        ]
+        dtypes = [dtype for array, dtype in zip(self.outputs, self.output_dtypes, strict=True) for _ in array.flat]
+        return read(values, self._results, dtypes, elements[0].shape if elements else ())
 
     def join(self, elements: Sequence[jax.Array]) -> list[jax.Array]:
         """The result's leaves from their elements."""
         leaves, begin = [], 0
+        batch = elements[0].shape if elements else ()
         for array, dtype in zip(self.outputs, self.output_dtypes, strict=True):
             part = elements[begin : begin + array.size]
             begin += array.size
-            leaves.append(jnp.stack(part).reshape(array.shape) if part else jnp.zeros(array.shape, dtype))
+            leaves.append(
+                jnp.stack(part, axis=-1).reshape(*batch, *array.shape)
+                if part
+                else jnp.zeros((*batch, *array.shape), dtype)
+            )
         return leaves
 
 
-def _list_elements(*leaves):
-    return [leaf[place] for leaf in leaves for place in np.ndindex(*leaf.shape)]
+@contextlib.contextmanager
+def _pause_collection() -> Iterator[None]:
+    """No garbage is collected: a trace makes objects that stay, over which the collector would go again and again."""
+    was_enabled = gc.isenabled()
+    gc.disable()
+    try:
+        yield
+    finally:
+        if was_enabled:
+            gc.enable()
 
 
+@_pause_collection()
 def trace(fn: Callable, *example_args: Any) -> Program:
     """Traces a function to its scalar equations."""
     closed, shape = jax.make_jaxpr(fn, return_shape=True)(*example_args)

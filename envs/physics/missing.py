@@ -111,7 +111,7 @@ def _check_references(spec: mujoco.MjSpec, names: set[str]) -> None:
         named = [(sensor.objtype, sensor.objname), (sensor.reftype, sensor.refname)]
         lost = [name for kind, name in named if kind == geom and name in names]
         if lost:
-            raise ValueError(f"the sensor '{sensor.name}' measures geom '{lost[0]}', whose mesh file is missing")
+            raise ValueError(f"the sensor '{sensor.name}' measures geom '{lost[0]}', whose file is missing")
 
 
 def _describe(spec: mujoco.MjSpec, missing: dict[str, list], geoms, lighter: list[str]) -> str:

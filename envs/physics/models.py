@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from envs.physics.features import CONTACT_FIELDS, JOINT_FIELDS, SENSOR_FIELDS
+from envs.physics.features import CONTACT_FIELDS, SENSOR_FIELDS
 from envs.physics.missing import leave_out_missing_files
 
 if TYPE_CHECKING:
@@ -20,7 +20,18 @@ if TYPE_CHECKING:
 
 
 # Fields of mjModel that MJX 3.17 never reads: the feature is not simulated, although one of its values is not 0.
-IGNORED_FIELDS = CONTACT_FIELDS | JOINT_FIELDS | SENSOR_FIELDS
+IGNORED_FIELDS = {
+    "jnt_stiffnesspoly": "higher stiffness coefficients of joints",
+    "dof_dampingpoly": "higher damping coefficients of joints",
+    "tendon_stiffnesspoly": "higher stiffness coefficients of tendons",
+    "tendon_dampingpoly": "higher damping coefficients of tendons",
+    "actuator_delay": "delay of actuators",
+    "actuator_damping": "damping of actuators",
+    "actuator_dampingpoly": "higher damping coefficients of actuators",
+    "actuator_armature": "armature of actuators",
+    **CONTACT_FIELDS,
+    **SENSOR_FIELDS,
+}
 # Sensors of forces and accelerations, which MJX leaves at 0 in a model without constraints.
 ACCELERATION_SENSORS = ("ACCELEROMETER", "FORCE", "TORQUE", "FRAMELINACC", "FRAMEANGACC")
 

@@ -90,10 +90,10 @@ def find_margin(model: mujoco.MjModel, pair: Pair) -> float:
     """The distance (m) at which MuJoCo makes a contact of the pair."""
     import mujoco
 
-    if pair.index >= 0:
-        return float(model.pair_margin[pair.index])
     if model.opt.enableflags & mujoco.mjtEnableBit.mjENBL_OVERRIDE:
         return float(model.opt.o_margin)
+    if pair.index >= 0:
+        return float(model.pair_margin[pair.index])
     return float(model.geom_margin[[pair.geom1, pair.geom2]].sum())
 
 

@@ -29,6 +29,8 @@ if TYPE_CHECKING:
 ALLOWANCE = {"hinge": 0.2, "slide": 0.2}
 MAX_BOXES = 2000  # boxes of joint positions to look at for two bodies
 NUM_SAMPLES = 300  # random positions that are tried first
+PARALLEL = 1e-12  # squared sine of an angle that is more than rounding
+SMALL = 1e-15  # mjMINVAL
 
 
 class Reach:
@@ -78,7 +80,9 @@ class Reach:
     def _find_distance(self, ends, normals, first: np.ndarray, second: np.ndarray, pairs):
         """Distances between the capsules of pairs, beyond the margin, `[N, P]` in m; unit vectors between them."""
         geoms = np.array([pair[:2] for pair in pairs])
-        gap = _find_gap(ends[:, first], ends[:, second])
+        middle, half = ends.mean(2), (ends[..., 1, :] - ends[..., 0, :]) / 2
+        offset, length = middle[:, second] - middle[:, first], np.linalg.norm(half, axis=-1)
+        gap = find_gap(offset, half[:, second], half[:, first], length[:, second], length[:, first], PARALLEL)
         apart = np.linalg.norm(gap, axis=-1)
         is_plane, normal = self._is_plane[geoms[:, 0]], normals[:, first]
         height = np.einsum("npki,npi->npk", ends[:, second] - ends[:, first, :1], normal).min(2)
@@ -277,25 +281,31 @@ def _find_arms(ends, anchors, axes, direction, is_slide) -> tuple[np.ndarray, np
     return arms, np.abs(np.einsum("npkji,npi->npkj", speeds, direction)).max(2)
 
 
-def _find_gap(one: np.ndarray, other: np.ndarray) -> np.ndarray:
-    """The shortest vector from one segment to another, given by their ends: between inner points, or from an end."""
-    u, v, w = one[..., 1, :] - one[..., 0, :], other[..., 1, :] - other[..., 0, :], other[..., 0, :] - one[..., 0, :]
-    uu, vv, uv, uw, vw = (np.sum(x * y, -1) for x, y in ((u, u), (v, v), (u, v), (u, w), (v, w)))
-    det = uu * vv - uv * uv
-    crossing = det > 1e-12 * uu * vv
-    safe = np.where(crossing, det, 1.0)
-    s, t = (uw * vv - uv * vw) / safe, (uv * uw - uu * vw) / safe
-    inner = crossing & (s > 0) & (s < 1) & (t > 0) & (t < 1)
-    gaps = [np.where(inner[..., None], w + t[..., None] * v - s[..., None] * u, np.inf)]
-    gaps += [-_find_point_gap(other[..., k, :], one) for k in (0, 1)]
-    gaps += [_find_point_gap(one[..., k, :], other) for k in (0, 1)]
-    nearest = np.argmin([np.linalg.norm(x, axis=-1) for x in gaps], 0)
-    return np.take_along_axis(np.array(gaps), nearest[None, ..., None], 0)[0]
+def find_gap(offset, u, v, one: np.ndarray, other: np.ndarray, parallel: float):
+    """The shortest vector from the segment t v to offset + s u, |s|, |t| <= 1, `[..., 3]`.
+
+    The best s for the whole lines, the best t for this s, and the best s for that t, each within its bounds, are the
+    solution (Ericson, "Real-Time Collision Detection", section 5.1.9).
+
+    Args:
+      offset, u, v: `[..., 3]`, arrays of numpy or of jax.
+      one, other: |u| and |v|, known when tracing, `[...]`.
+      parallel: the squared sine of an angle below which s and t are less exact; more than the rounding errors.
+    """
+    gap = offset
+    if not other.any():
+        return offset + _divide(-(u * offset).sum(-1), one)[..., None] * u if one.any() else offset
+    along_other = (v * offset).sum(-1)
+    if one.any():
+        along_one, mixed, areas = (u * offset).sum(-1), (u * v).sum(-1), (one * other) ** 2
+        across = (areas - mixed**2).clip(parallel * areas + SMALL)
+        s = ((mixed * along_other - along_one * other**2) / across).clip(-1, 1)
+        s = _divide(mixed * _divide(mixed * s + along_other, other) - along_one, one)
+        gap = offset + s[..., None] * u
+        along_other = along_other + s * mixed
+    return gap - _divide(along_other, other)[..., None] * v
 
 
-def _find_point_gap(point: np.ndarray, segment: np.ndarray) -> np.ndarray:
-    """The shortest vector from a point to a segment."""
-    along, away = segment[..., 1, :] - segment[..., 0, :], point - segment[..., 0, :]
-    square = np.sum(along * along, -1)
-    share = np.clip(np.sum(away * along, -1) / np.where(square > 0, square, 1), 0, 1)
-    return share[..., None] * along - away
+def _divide(x, length: np.ndarray):
+    """x / length^2 between -1 and 1; 0 for a segment without length."""
+    return (x * np.where(length > 0, 1 / np.maximum(length, 1e-6) ** 2, 0.0)).clip(-1, 1)

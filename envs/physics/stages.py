@@ -23,7 +23,7 @@ from jax import lax
 # Jax has no stable API for metadata yet. Without it stages compute the same but slower, as XLA inlines them.
 from jax.experimental.xla_metadata import set_xla_metadata
 
-from envs.physics.expressions import Expression, Scalar
+from envs.physics.expressions import Expression, Scalar, build
 from envs.physics.loops import Loop, find_loop, is_result
 from envs.physics.trigonometry import sincos
 
@@ -48,9 +48,13 @@ STORING = 10
 # threads (`envs.physics.tiles`): a loop that joins two such values has less than a hundred additions, and XLA begins to
 # split arrays of 128 numbers at about 150.
 LARGEST = 48
+# These are stored even if they are used once. With 1,024 environments XLA splits a loop of a sine and a few other
+# operations between two threads, which takes three times as long as two loops on one thread.
+STORED = ("sin", "cos")
 # Equations per kernel. Compile time grows faster than this number, and kernels are compiled in parallel; a seven-joint
 # arm runs a seventh slower in three kernels than in one.
 KERNEL = 3000
+MOST_ROUNDS = 2**30  # of a loop: more than there ever are
 
 
 @dataclass(frozen=True)
@@ -89,7 +93,9 @@ def make_stages(outputs: Iterable[Expression]) -> list[Stage]:
             loop = find_loop(expression)[0] if is_result(expression) else None
             groups[depth[expression.index], loop].append(expression)
     return [
-        _make_stage(groups[level, loop], depth) if loop is None else _make_loop(groups[level, loop], _make_body(loop))
+        _make_stage(groups[level, loop], depth)
+        if loop is None
+        else _make_loop(groups[level, loop], make_stages(_select_following(loop)))
         for level, loop in sorted(groups, key=lambda key: key[0])
     ]
 
@@ -147,7 +153,8 @@ def _choose_stored(equations: list[Expression], wanted: set[int]) -> dict[int, i
         depth[expression.index] = level
         cost = sum(COST.get(part.op, 1) for part in computed)
         is_costly = (uses[expression.index] - 1) * cost > STORING or cost > LARGEST
-        if expression.index in wanted or is_costly or is_result(expression):
+        is_always_stored = expression.index in wanted or expression.op in STORED or is_result(expression)
+        if is_costly or is_always_stored:
             stored[expression.index] = level
         else:
             repeated[expression.index] = computed
@@ -163,9 +170,12 @@ def _make_stage(outputs: list[Expression], stored: dict[int, int]) -> Stage:
     return Stage(equations, inputs, outputs, compile_separately(compute))
 
 
-def _make_body(loop: Loop) -> list[Stage]:
-    """The stages of one round."""
-    return make_stages(loop.outputs())
+def _select_following(loop: Loop) -> list[Expression]:
+    """The values after a round; an environment that is done keeps its values while others of its batch go on."""
+    goes_on = loop.carried[0]
+    return [
+        build("select_n", goes_on, before, after) for before, after in zip(loop.carried, loop.following, strict=True)
+    ]
 
 
 def _make_loop(results: list[Expression], body: list[Stage]) -> Stage:
@@ -177,33 +187,43 @@ def _make_loop(results: list[Expression], body: list[Stage]) -> Stage:
 
     def compute(*values):
         known = dict(zip((x.index for x in inputs), values, strict=True))
-        carry = _repeat(loop, body, _read(known, operands, [x.dtype for x in loop.carried + loop.captured]))
+        batch = np.broadcast_shapes(*(x.shape for x in values))
+        carry = _repeat(loop, body, read(known, operands, [x.dtype for x in loop.carried + loop.captured], batch))
         return [carry[place] for place in places]
 
     return Stage(results, inputs, results, compile_separately(compute), body)
 
 
 def _repeat(loop: Loop, body: list[Stage], operands: list[jax.Array]) -> tuple[jax.Array, ...]:
-    """The carried values after the last round.
+    """The carried values after the last round of all environments.
 
     Whether there is another round is itself carried, as under `vmap` jax computes the condition twice in a round.
     """
     num_carried = len(loop.carried)
     captured = dict(zip((x.index for x in loop.captured), operands[num_carried:], strict=True))
     dtypes = [x.dtype for x in loop.carried]
+    following, batch = _select_following(loop), operands[0].shape
 
-    def advance(carry):
+    def advance(state):
+        count, *carry = state
         values = captured | dict(zip((x.index for x in loop.carried), carry, strict=True))
         run(body, values)
-        return tuple(_read(values, loop.following, dtypes))
+        return count + 1, *read(values, following, dtypes, batch)
 
-    return lax.while_loop(lambda carry: carry[0], advance, tuple(operands[:num_carried]))
+    # XLA's CPU compiler (jaxlib 0.10.1) takes a loop whose body is nothing but one call of the carried values, in their
+    # order, for one that changes none of them, and it never ends. The count is not part of the call.
+    state = lax.while_loop(
+        lambda state: jnp.any(state[1]) & (state[0] < MOST_ROUNDS), advance, (np.int32(0), *operands[:num_carried])
+    )
+    return state[1:]
 
 
-def _read(values: dict[int, Any], scalars: Iterable[Scalar], dtypes: Iterable[np.dtype]) -> list[jax.Array]:
-    """The values of expressions and constants."""
+def read(
+    values: dict[int, Any], scalars: Iterable[Scalar], dtypes: Iterable[np.dtype], batch: tuple[int, ...]
+) -> list[jax.Array]:
+    """The values of expressions and constants, of the shape of the batch."""
     return [
-        values[x.index] if isinstance(x, Expression) else jnp.asarray(x, dtype)
+        values[x.index] if isinstance(x, Expression) else jnp.full(batch, x, dtype)
         for x, dtype in zip(scalars, dtypes, strict=True)
     ]
 
@@ -264,7 +284,7 @@ def is_large_loop(stage: Stage) -> bool:
 def _split_loop(stage: Stage) -> Stage:
     """A loop around kernels, for one that is too large for a kernel."""
     loop, _ = find_loop(stage.outputs[0])
-    return _make_loop(stage.outputs, join_into_kernels(list(stage.body), loop.outputs()))
+    return _make_loop(stage.outputs, join_into_kernels(list(stage.body), _select_following(loop)))
 
 
 def _join(group: list[Stage], used: set[int]) -> Stage:
@@ -311,16 +331,19 @@ def evaluate(equations: list[Expression], values: dict[int, Any], outputs: list[
             values[expression.index] = pairs[angle.index][expression.op == "cos"]
         else:
             function = LAX.get(expression.op) or getattr(lax, expression.op)
-            arguments = _convert_constants(expression)
-            operands = [values[arg.index] if isinstance(arg, Expression) else arg for arg in arguments]
-            values[expression.index] = function(*operands, **dict(expression.params))
+            values[expression.index] = function(*_read_operands(expression, values), **dict(expression.params))
     return [values[x.index] for x in outputs]
 
 
-def _convert_constants(expression: Expression) -> list:
-    """The operands, with constants converted to the dtype of the others."""
-    dtype = next((arg.dtype for arg in _operands(expression) if arg.dtype.kind != "b"), expression.dtype)
+def _read_operands(expression: Expression, values: dict[int, Any]) -> list:
+    """The operands, with constants converted to the dtype of the others, and as `jax.lax` broadcasts them."""
+    arguments = _operands(expression)
+    dtype = next((arg.dtype for arg in arguments if arg.dtype.kind != "b"), expression.dtype)
+    batch = values[arguments[0].index].shape
+    shape = {"select_n": batch, "clamp": ()}.get(expression.op, (1,) * len(batch))
     return [
-        arg if isinstance(arg, Expression) else np.asarray(arg, bool if isinstance(arg, bool) else dtype)
+        values[arg.index]
+        if isinstance(arg, Expression)
+        else np.full(shape, arg, bool if isinstance(arg, bool) else dtype)
         for arg in expression.args
     ]

@@ -18,7 +18,17 @@ import jax.numpy as jnp
 
 from envs.physics.callback import make_callback_step
 from envs.physics.collision import change_collision, describe_meshes
-from envs.physics.fields import FLAG, STATE, check_names, convert_arguments, find_types, make_single_step
+from envs.physics.fields import (
+    ADDED,
+    FLAG,
+    STATE,
+    check_names,
+    convert_arguments,
+    find_outputs,
+    find_types,
+    list_fields,
+    make_single_step,
+)
 from envs.physics.interpreter import Program
 from envs.physics.models import MujocoModelError, import_mjx, model_digest, model_name, put_whole_model
 from envs.physics.pairs import has_constraints
@@ -37,7 +47,7 @@ WARMSTART = "qacc_warmstart"
 StepFn = Callable[..., tuple[jax.Array, ...]]
 
 _latest: dict[str, Program] = {}  # the last program made, by its name: a check and its step need the same one
-_warned: set[bytes] = set()  # digests of the models that `_warn_once` has warned about
+_warned: set[bytes] = set()  # digests of the models that `warn_once` has warned about
 
 
 def compile_step(
@@ -105,15 +115,16 @@ def make_scalar_step(
       outputs: the inputs that a step changes, in their order, followed by other outputs.
     """
     colliding = change_collision(model, "primitives")
-    if num_substeps > 1 and WARMSTART not in inputs and has_constraints(colliding):
-        return _make_warm_step(model, num_substeps, inputs, outputs)
+    hidden = _find_hidden(colliding, inputs, outputs) if num_substeps > 1 else ()
+    if hidden:
+        return _make_continued_step(model, num_substeps, inputs, outputs, hidden)
     try:
         program = make_scalar_program(colliding, inputs, outputs)
     except (UnsupportedPrimitiveError, MujocoModelError) as error:
-        _warn_once(model, _describe_floor(_describe_reason(model, error)))
+        warn_once(model, describe_floor(model, error))
         return make_callback_step(model, num_substeps, inputs, outputs)
     if meshes := describe_meshes(model):
-        _warn_once(model, meshes)
+        warn_once(model, meshes)
     make_function = functools.partial(_make_program_step, inputs, num_substeps)
 
     def differentiable(*arrays):
@@ -129,26 +140,43 @@ def make_scalar_step(
     )
 
 
-def _make_warm_step(
-    model: mujoco.MjModel, num_substeps: int, inputs: tuple[str, ...], outputs: tuple[str, ...]
+def _find_hidden(model: mujoco.MjModel, inputs: tuple[str, ...], outputs: tuple[str, ...]) -> tuple[str, ...]:
+    """What a substep hands to the next one besides the inputs: where the solver starts, and a time that is read."""
+    import mujoco
+
+    fields = list_fields(outputs)
+    has_clock = "sensordata" in fields and mujoco.mjtSensor.mjSENS_CLOCK in model.sensor_type
+    needed = {WARMSTART: has_constraints(model), "time": "time" in fields or has_clock}
+    return tuple(name for name, here in needed.items() if here and name not in inputs)
+
+
+def _make_continued_step(
+    model: mujoco.MjModel, num_substeps: int, inputs: tuple[str, ...], outputs: tuple[str, ...], hidden: tuple[str, ...]
 ) -> StepFn:
-    """The step in which the solver of each substep may start from the acceleration of the last one."""
+    """The step in which each substep hands the hidden fields, first 0, to the next one.
+
+    With `qacc_warmstart` the solver may start from the acceleration of the last substep.
+    """
     place = len(_find_carried(inputs))
-    extended = (*outputs[:place], WARMSTART, *outputs[place:])
-    step = make_scalar_step(model, num_substeps, (*inputs, WARMSTART), extended)
+    extended = (*outputs[:place], *hidden, *outputs[place:])
+    step = make_scalar_step(model, num_substeps, (*inputs, *hidden), extended)
 
-    def start_cold(*arrays):
-        results = step(*arrays, jnp.zeros(model.nv))
-        return (*results[:place], *results[place + 1 :])
+    def start(*arrays):
+        results = step(*arrays, *(jnp.zeros(x.shape, x.dtype) for x in find_types(model, hidden)))
+        return (*results[:place], *results[place + len(hidden) :])
 
-    return start_cold
+    return start
 
 
 def make_mjx_step(
     model: mujoco.MjModel, num_substeps: int, inputs: tuple[str, ...], outputs: tuple[str, ...]
 ) -> StepFn:
     """The substeps by `mjx.step`; arguments as in `make_scalar_step`."""
-    substep, _ = make_single_step(put_whole_model(model), inputs, outputs, import_mjx().step)
+    missing = [name for name in list_fields(outputs) if name in ADDED]
+    if missing:
+        raise ValueError(f"{missing[0]}: mjx.step does not compute it; physics 'scalar' and 'mujoco' do")
+    outputs_found = find_outputs(model, outputs)
+    substep, _ = make_single_step(put_whole_model(model), inputs, outputs_found, import_mjx().step)
 
     def step(*arrays):
         return _repeat(lambda values: substep(*values), inputs, _find_carried(inputs), num_substeps, arrays)
@@ -207,7 +235,11 @@ def make_scalar_program(
 
         return trace_step(model, inputs, outputs, differentiable)
 
-    name = make_name(model, inputs, outputs, differentiable)
+    return remember(make_name(model, inputs, outputs, differentiable), make)
+
+
+def remember(name: str, make: Callable[[], Program]) -> Program:
+    """The program with this name: the last one, or from the store, or else from `make`."""
     if name not in _latest:
         program = load_or_make(name, make)
         _latest.clear()
@@ -215,14 +247,15 @@ def make_scalar_program(
     return _latest[name]
 
 
-def _describe_floor(reason: str) -> str:
+def describe_floor(model: mujoco.MjModel, error: Exception) -> str:
+    """Why C MuJoCo steps the model."""
     return (
         "it has no form as scalar equations and is stepped by C MuJoCo, at its speed and without gradients, because "
-        f"of: {reason}. See docs/physics.md"
+        f"of: {_describe_reason(model, error)}. See docs/physics.md"
     )
 
 
-def _warn_once(model: mujoco.MjModel, line: str) -> None:
+def warn_once(model: mujoco.MjModel, line: str) -> None:
     """Logs a line about how the model is stepped, once for each model in this process."""
     digest = model_digest(model)
     if digest not in _warned:
@@ -246,7 +279,8 @@ def _make_program_step(inputs, num_substeps: int, program: Program, stages: list
         )
 
     def step(*arrays):
-        elements = program.split((*arrays, jnp.zeros(())) if is_watching else arrays)
+        batch = arrays[0].shape[: arrays[0].ndim - program.inputs[0].ndim]
+        elements = program.split((*arrays, jnp.zeros(batch)) if is_watching else arrays)
         results = list(_repeat(run, names, carried, num_substeps, elements))
         return tuple(program.join(_move(results, num_carried - 1, len(results) - 1) if is_watching else results))
 

@@ -20,13 +20,13 @@ from jax.core import ShapedArray
 from jax.extend.core import Primitive
 from jax.interpreters import ad, batching, mlir
 
+from envs.batches import LANES
 from envs.physics.interpreter import Program
 from envs.physics.stages import Stage, is_large_loop, make_kernel
 
 # Environments per tile. In smaller tiles the loops are too short; from 256 on XLA splits large loops between threads,
 # which is impossible inside a kernel.
 TILE = 128
-LANES = 16  # the size of a tile is a multiple of this, so that loops are fully vectorised
 # Programs with so few loops gain nothing: the pendulum's 4 are slower in tiles, a cart-pole's 10 faster.
 FEW_LOOPS = 8
 # Size of the largest array of one environment; XLA splits larger loops between threads too.
@@ -84,7 +84,7 @@ def _run_plain(*arrays, function, replace, is_batched, **_):
 def _run_tiled(*arrays, function, tile_function, replace, is_batched, **_):
     if tile_function is None or not is_batched:
         return _run_plain(*arrays, function=function, replace=replace, is_batched=is_batched)
-    return _replace_flagged(arrays, _run_tiles(jax.vmap(tile_function), arrays), replace, is_batched)
+    return _replace_flagged(arrays, _run_tiles(tile_function, arrays), replace, is_batched)
 
 
 def _run_tiles(tile: Callable, arrays: tuple) -> tuple:

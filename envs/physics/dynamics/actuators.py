@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import jax.numpy as jnp
 import mujoco
@@ -11,7 +11,7 @@ import numpy as np
 from envs.physics.dynamics.codes import BIAS, DISABLED, DYNAMICS, GAIN, TRANSMISSION
 from envs.physics.dynamics.forces import JOINT_TRANSMISSIONS, is_disabled
 from envs.physics.dynamics.numbers import SMALL, at_least_small, get_number, is_zero, module_of
-from envs.physics.dynamics.rotations import contract
+from envs.physics.dynamics.rotations import contract, length
 from envs.physics.dynamics.smooth import Smooth
 from envs.physics.dynamics.tree import BALL
 
@@ -162,29 +162,30 @@ def _find_inputs(model, mx, d: mjx.Data, ctrl):
     return _wrap(inputs, d.actuator_length, find_periods(model, mx))
 
 
-def find_periods(model: mujoco.MjModel, mx: mjx.Model) -> np.ndarray:
+def find_periods(model: mujoco.MjModel, mx: mjx.Model) -> Any:
     """Period of the set-points of position servos on rotations, 2 pi |gear|, and 0 for other actuators [nu]."""
-    gain, bias = model.actuator_gainprm[:, 0], model.actuator_biasprm[:, 1]
-    servo = (
-        (model.actuator_gaintype == GAIN.FIXED)
-        & (model.actuator_biastype == BIAS.AFFINE)
-        & np.isin(model.actuator_dyntype, (DYNAMICS.NONE, DYNAMICS.INTEGRATOR))
-        & (gain == -bias)
-    )
-    gear, target = model.actuator_gear, model.actuator_trnid
-    at_site = (model.actuator_trntype == TRANSMISSION.SITE) & (target[:, 1] >= 0) & ~gear[:, :3].any(-1)
+    gear, target = get_number(model, mx, "actuator_gear"), model.actuator_trnid
     at_joint = np.isin(model.actuator_trntype, JOINT_TRANSMISSIONS)
     if model.njnt:
         at_joint &= model.jnt_type[np.where(at_joint, target[:, 0], 0)] == BALL
-    turning = np.where(at_site[:, None], gear[:, 3:], gear[:, :3])
-    return 2.0 * np.pi * np.linalg.norm(turning, axis=-1) * (servo & (at_site | at_joint))
+    at_site = (model.actuator_trntype == TRANSMISSION.SITE) & (target[:, 1] >= 0)
+    turns = (at_joint | (at_site & ~model.actuator_gear[:, :3].any(-1))) & (
+        (model.actuator_gaintype == GAIN.FIXED)
+        & (model.actuator_biastype == BIAS.AFFINE)
+        & np.isin(model.actuator_dyntype, (DYNAMICS.NONE, DYNAMICS.INTEGRATOR))
+    )
+    if not turns.any():
+        return np.zeros(model.nu)
+    is_servo = get_number(model, mx, "actuator_gainprm")[:, 0] == -get_number(model, mx, "actuator_biasprm")[:, 1]
+    turning = jnp.where(at_site[:, None], gear[:, 3:], gear[:, :3])
+    return 2.0 * np.pi * length(turning) * (turns & is_servo)
 
 
-def _wrap(setpoint, length, period: np.ndarray):
+def _wrap(setpoint, length, period):
     """The set-points nearest to the lengths of those that differ by whole periods."""
-    if not period.any():
+    if is_zero(period):
         return setpoint
-    safe = np.where(period > 0, period, 1.0)
+    safe = jnp.where(period > 0, period, 1.0)
     turns = jnp.floor((setpoint - length) / safe + 0.5)
     return jnp.where(period > 0, setpoint - period * turns, setpoint)
 
@@ -193,7 +194,7 @@ def wrap_activations(model: mujoco.MjModel, mx: mjx.Model, d: mjx.Data, act):
     """Set-points stored in activations, as the ones nearest to the lengths [na]."""
     owners = _owners(model)
     period = find_periods(model, mx)[owners] * (model.actuator_dyntype[owners] == DYNAMICS.INTEGRATOR)
-    return _wrap(act, d.actuator_length[owners], period) if period.any() else act
+    return _wrap(act, d.actuator_length[owners], period)
 
 
 # --- gains ------------------------------------------------------------------------------------------------------------

@@ -2,19 +2,24 @@
 
 from __future__ import annotations
 
+import itertools
 from collections import Counter
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Iterator, Sequence
 
 import mujoco
 import numpy as np
 
+from envs.physics.callback import INITIAL_COUNT, has_diverged
 from envs.physics.dynamics.shapes import DEEPEST_ONLY, NUM_CONTACTS
 from envs.physics.pairs import Pair, get_shapes
 from envs.physics.primitives import UnsupportedPrimitiveError
 
 MOST_CONTACTS = 32  # points of contact that the equations of a step may have
-SECONDS = 1.0  # of the simulation that shows what touches, from each keyframe, or else from the initial position
-SELDOM = 0.05  # share of its steps; what touches in fewer is not chosen
+SECONDS = 1.0  # of each simulation that shows what touches, from each keyframe, or else from the initial position
+COMMANDED = 16  # simulations with random commands
+SELDOM = 0.05  # share of the steps without commands; what touches in fewer is not chosen
+LIGHT = 80  # as `_weigh` has it: some 500 equations
+OFTEN = 0.2  # share of the steps with random commands, which are rougher than those of most tasks
 VARYING_SHAPES = ("geom_pos", "geom_quat", "geom_size", "geom_rbound", "geom_aabb", "geom_margin", "pair_margin")
 # Pairs of shapes whose contacts are C MuJoCo's only up to the accuracy, or the number of points, of its own iteration.
 APPROXIMATE = DEEPEST_ONLY | {("ellipsoid", "ellipsoid")}
@@ -25,8 +30,10 @@ def choose_pairs(
 ) -> tuple[list[Pair], list[Pair]]:
     """(chosen, watched): the pairs whose contacts are written out as equations, and the others.
 
-    Chosen are contacts with fixed planes, and what touches while the robot stands or falls without commands, most
-    frequent ones first, up to `MOST_CONTACTS` points. If planes alone have more, they too must touch to be chosen.
+    Chosen are the contacts of robots that go anywhere with fixed planes; what touches while the robot stands or falls
+    without commands; and between bodies that often touch under random commands all contacts that cost little, because
+    few joints move the geoms against each other, as with the fingers of a gripper. All of it up to `MOST_CONTACTS`
+    points, most frequent ones first. If planes alone have more, they too must touch to be chosen.
 
     Args:
       model: a compiled model.
@@ -45,16 +52,52 @@ def choose_pairs(
     floor = [pair for pair in possible if _is_floor(model, pair)]
     chosen = floor if count_points(model, floor) <= MOST_CONTACTS else []
     others = [pair for pair in possible if pair not in chosen]
-    for pair in _list_frequent(model, others) if others else []:
+    light = [pair for pair in others if _weigh(model, pair) <= LIGHT]
+    often = {_find_bodies(model, pair) for pair in _list_frequent(model, light, COMMANDED, OFTEN)}
+    meeting = [pair for pair in light if _find_bodies(model, pair) in often]
+    for pair in dict.fromkeys([*_list_frequent(model, others, 0, SELDOM), *meeting]):
         if count_points(model, [*chosen, pair]) <= MOST_CONTACTS:
             chosen = [*chosen, pair]
     return chosen, [pair for pair in pairs if pair not in chosen]
 
 
 def _is_floor(model: mujoco.MjModel, pair: Pair) -> bool:
-    """Whether the first geom is a plane that does not move."""
-    is_fixed = model.body_weldid[model.geom_bodyid[pair.geom1]] == 0
-    return bool(is_fixed) and get_shapes(model, pair)[0] == "plane"
+    """Whether the first geom is a plane that does not move, and the second one's body goes as far as it likes."""
+    one, other = _find_bodies(model, pair)
+    is_fixed = model.body_weldid[one] == 0
+    return bool(is_fixed) and get_shapes(model, pair)[0] == "plane" and _goes_anywhere(model, other)
+
+
+def _find_bodies(model: mujoco.MjModel, pair: Pair) -> tuple[int, int]:
+    """The numbers of the two bodies."""
+    return int(model.geom_bodyid[pair.geom1]), int(model.geom_bodyid[pair.geom2])
+
+
+def _goes_anywhere(model: mujoco.MjModel, body: int) -> bool:
+    """Whether a free joint or a slide without limits moves the body."""
+    joints = np.unique(model.dof_jntid[list_dofs(model, body)])
+    types, is_limited = model.jnt_type[joints], model.jnt_limited[joints].astype(bool)
+    is_slide = types == mujoco.mjtJoint.mjJNT_SLIDE
+    return bool(np.any((types == mujoco.mjtJoint.mjJNT_FREE) | (is_slide & ~is_limited)))
+
+
+def list_dofs(model: mujoco.MjModel, body: int) -> list[int]:
+    """The degrees of freedom that move a body."""
+    dofs = []
+    while body:
+        first = int(model.body_dofadr[body])
+        dofs += range(first, first + int(model.body_dofnum[body]))
+        body = int(model.body_parentid[body])
+    return dofs
+
+
+def _weigh(model: mujoco.MjModel, pair: Pair) -> int:
+    """Points of contact, times condim^2, times the degrees of freedom that move the geoms against each other.
+
+    The Hessian's part of a contact has about eight times as many equations.
+    """
+    one, other = (set(list_dofs(model, body)) for body in _find_bodies(model, pair))
+    return NUM_CONTACTS[get_shapes(model, pair)] * pair.condim**2 * len(one ^ other)
 
 
 def count_points(model: mujoco.MjModel, pairs: Sequence[Pair]) -> int:
@@ -62,18 +105,45 @@ def count_points(model: mujoco.MjModel, pairs: Sequence[Pair]) -> int:
     return sum(NUM_CONTACTS[get_shapes(model, pair)] for pair in pairs)
 
 
-def _list_frequent(model: mujoco.MjModel, pairs: Sequence[Pair]) -> list[Pair]:
-    """The pairs that touch in at least the share `SELDOM` of the steps of a simulation, most frequent first."""
+def _list_frequent(model: mujoco.MjModel, pairs: Sequence[Pair], commanded: int, least: float) -> list[Pair]:
+    """The pairs that touch in at least a share of the steps of simulations, most frequent first.
+
+    Args:
+      model, pairs: as in `choose_pairs`.
+      commanded: the number of simulations with random commands, or 0 for one from each start without commands.
+      least: the share.
+    """
+    if not pairs or (commanded and not model.nu):
+        return []
     counts: Counter[frozenset[int]] = Counter()
-    num_steps = max(int(SECONDS / model.opt.timestep), 1)
-    starts = range(model.nkey) if model.nkey else [None]
-    for key in starts:
+    starts = list(range(model.nkey)) or [None]
+    runs = list(itertools.islice(itertools.cycle(starts), commanded)) if commanded else starts
+    random, num_steps = np.random.default_rng(0), 0
+    for key in runs:
         data = mujoco.MjData(model)
         if key is not None:
             mujoco.mj_resetDataKeyframe(model, data, key)
-        for _ in range(num_steps):
-            mujoco.mj_step(model, data)
-            touching = data.contact.geom[np.asarray(data.contact.efc_address) >= 0]
-            counts.update({frozenset(geoms) for geoms in touching.tolist()})
-    share = {pair: counts[frozenset((pair.geom1, pair.geom2))] / (num_steps * len(starts)) for pair in pairs}
-    return sorted((pair for pair in pairs if share[pair] >= SELDOM), key=lambda pair: -share[pair])
+        if commanded:
+            data.ctrl[:] = _draw_commands(model, random)
+        for touching in _simulate(model, data):
+            counts.update(touching)
+            num_steps += 1
+    share = {pair: counts[frozenset((pair.geom1, pair.geom2))] / max(num_steps, 1) for pair in pairs}
+    return sorted((pair for pair in pairs if share[pair] >= least), key=lambda pair: -share[pair])
+
+
+def _simulate(model: mujoco.MjModel, data: mujoco.MjData) -> Iterator[set[frozenset[int]]]:
+    """The pairs of geoms that touch in each step, until the end or until the motion diverges."""
+    data.warning.number[:] = INITIAL_COUNT
+    for _ in range(max(int(SECONDS / model.opt.timestep), 1)):
+        mujoco.mj_step(model, data)
+        if has_diverged(data.warning.number):
+            return
+        touching = data.contact.geom[np.asarray(data.contact.efc_address) >= 0]
+        yield {frozenset(geoms) for geoms in touching.tolist()}
+
+
+def _draw_commands(model: mujoco.MjModel, random: np.random.Generator) -> np.ndarray:
+    """Controls over the whole range of each actuator, or between -1 and 1 where it has none."""
+    is_limited = model.actuator_ctrllimited.astype(bool)[:, None]
+    return random.uniform(*np.where(is_limited, model.actuator_ctrlrange, [-1.0, 1.0]).T)

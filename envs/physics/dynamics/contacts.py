@@ -5,14 +5,16 @@ contact along the normal, along two tangents (k >= 3), and their relative angula
 and about the tangents (k = 6).
 
 The acceleration of a body, as a spatial vector, is the sum of what the degrees of freedom on its path to the world
-contribute, and a force on the body acts on the same degrees of freedom. So products with J and J' need one pass over
-the tree of bodies each, and contacts with fixed bodies enter the Hessian in the way in which inertia enters the mass
-matrix: as spatial matrices `[6, 6]`, summed up the tree.
+contribute, and a force on the body acts on the same degrees of freedom. So for contacts with fixed bodies, products
+with J and J' need one pass over the tree of bodies each, and these contacts enter the Hessian in the way in which
+inertia enters the mass matrix: as spatial matrices `[6, 6]`, summed up the tree. Contacts of two bodies that move
+depend on the few degrees of freedom that move one of them and not the other: there J is written out.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, NamedTuple
 
 import jax
@@ -21,7 +23,7 @@ import mujoco
 import numpy as np
 
 from envs.physics.dynamics.cones import Cone, Ellipse, Pyramid
-from envs.physics.dynamics.constraints import find_impedance, find_regularization
+from envs.physics.dynamics.impedance import find_impedance, find_regularization
 from envs.physics.dynamics.kinematics import find_joint_axes
 from envs.physics.dynamics.numbers import get_number
 from envs.physics.dynamics.rotations import cross_each
@@ -37,7 +39,8 @@ class Contact(NamedTuple):
     """n possible contacts of the same dimension.
 
     Attributes:
-      first, second: the bodies, as numbers known when tracing, `[n]`.
+      geoms: the two geoms, as numbers known when tracing, `[n, 2]`.
+      first, second: the bodies, likewise, `[n]`.
       distance: of the surfaces, negative inside, `[n]`.
       position: the point halfway between the surfaces, `[n, 3]`.
       frame: rows are the normal, from the first body to the second, and two tangents, `[n, 3, 3]`.
@@ -46,6 +49,7 @@ class Contact(NamedTuple):
       solref, solreffriction, solimp: MuJoCo's parameters, `[n, 2]`, `[n, 2]`, `[n, 5]`.
     """
 
+    geoms: np.ndarray
     first: np.ndarray
     second: np.ndarray
     distance: jax.Array
@@ -76,26 +80,39 @@ def _collide(model, mx, d, shapes: tuple[str, str], pairs: list[Pair]) -> Contac
     """The contacts of pairs of the same shapes; a pair may touch at several points."""
     ids = np.array([(pair.geom1, pair.geom2) for pair in pairs]).T
     parts = [_mix_parameters(model, mx, pair) for pair in pairs]
-    margin, gap, *parameters = (jnp.stack(column) for column in zip(*parts, strict=True))
+    margin, *parameters = (jnp.stack(column) for column in zip(*parts, strict=True))
     one, other = (Shape(d.geom_xpos[i], d.geom_xmat[i], get_number(model, mx, "geom_size")[i]) for i in ids)
     distance, position, frame = jax.vmap(PAIRS[shapes])(one, other, margin)
     number = distance.shape[1]
-    first, second = (np.repeat(model.geom_bodyid[i], number) for i in ids)
+    geoms = np.repeat(ids.T, number, axis=0)
+    first, second = model.geom_bodyid[geoms].T
     flat = (x.reshape(-1, *x.shape[2:]) for x in (distance, position, frame))
-    return Contact(first, second, *flat, *(jnp.repeat(x, number, axis=0) for x in (margin - gap, *parameters)))
+    return Contact(geoms, first, second, *flat, *(jnp.repeat(x, number, axis=0) for x in (margin, *parameters)))
 
 
 def _concatenate(parts: list[Contact]) -> Contact:
-    first, second, *others = zip(*parts, strict=True)
-    return Contact(np.concatenate(first), np.concatenate(second), *map(jnp.concatenate, others))
+    geoms, first, second, *others = zip(*parts, strict=True)
+    bodies = np.concatenate(first), np.concatenate(second)
+    return Contact(np.concatenate(geoms), *bodies, *map(jnp.concatenate, others))
 
 
 def _mix_parameters(model: mujoco.MjModel, mx: mjx.Model, pair: Pair) -> tuple:
-    """(margin, gap, friction, solref, solreffriction, solimp) of a pair: its own, or mixed from those of the geoms."""
+    """(margin, friction, solref, solreffriction, solimp) of a pair: its own, or mixed from those of the geoms.
+
+    The gap, by which C MuJoCo finds contacts before they act, has no influence on the motion. With the flag `override`,
+    all contacts have the parameters of the options.
+    """
+    margin, friction, solref, solreffriction, solimp = _find_own(model, mx, pair)
+    if model.opt.enableflags & mujoco.mjtEnableBit.mjENBL_OVERRIDE:
+        option = model.opt
+        margin, friction, solref, solimp = option.o_margin, option.o_friction, option.o_solref, option.o_solimp
+    return margin, jnp.maximum(friction, mujoco.mjMINMU), solref, solreffriction, solimp
+
+
+def _find_own(model: mujoco.MjModel, mx: mjx.Model, pair: Pair) -> tuple:
     if pair.index >= 0:
-        names = ("margin", "gap", "friction", "solref", "solreffriction", "solimp")
-        margin, gap, friction, *others = (get_number(model, mx, f"pair_{name}")[pair.index] for name in names)
-        return margin, gap, jnp.maximum(friction, mujoco.mjMINMU), *others
+        names = ("margin", "friction", "solref", "solreffriction", "solimp")
+        return tuple(get_number(model, mx, f"pair_{name}")[pair.index] for name in names)
     geoms = np.array([pair.geom1, pair.geom2])
     priority = model.geom_priority[geoms]
     if priority[0] != priority[1]:
@@ -108,8 +125,7 @@ def _mix_parameters(model: mujoco.MjModel, mx: mjx.Model, pair: Pair) -> tuple:
     ids = np.array([pair.geom1, pair.geom2])
     return (
         jnp.sum(get_number(model, mx, "geom_margin")[ids]),
-        jnp.sum(get_number(model, mx, "geom_gap")[ids]),
-        jnp.maximum(friction[np.array([0, 0, 1, 2, 2])], mujoco.mjMINMU),
+        friction[np.array([0, 0, 1, 2, 2])],
         jnp.where(is_standard, mixed, jnp.min(solref, axis=0)),
         jnp.zeros(2),
         share * solimp[0] + (1 - share) * solimp[1],
@@ -127,37 +143,17 @@ def _find_share(first: jax.Array, second: jax.Array) -> jax.Array:
 # --- contacts as constraints ------------------------------------------------------------------------------------------
 
 
-class ContactRows(NamedTuple):
+@dataclass(frozen=True)
+class ContactRows:
     """Contacts of the same dimension k, n of them, as a group of constraints.
 
     Attributes:
-      tree: the tree of bodies.
-      motion: spatial velocity (angular, linear) per velocity of each degree of freedom, `[nv, 6]`.
-      first, second: the bodies, `[n]`.
-      arms: components of u per relative spatial acceleration of the second body, `[n, k, 6]`.
       reference: r, `[n, k]`.
       cone: the convex function s of each contact.
     """
 
-    tree: BodySums
-    motion: jax.Array
-    first: np.ndarray
-    second: np.ndarray
-    arms: jax.Array
     reference: jax.Array
     cone: Cone
-
-    def apply(self, velocity: jax.Array) -> jax.Array:
-        """J v, `[n, k]`."""
-        return _find_relative(self.tree, self.motion, self.first, self.second, self.arms, velocity)
-
-    def pull(self, forces: jax.Array) -> jax.Array:
-        """J' w, `[nv]`."""
-        wrenches = jnp.einsum("nki,nk->ni", self.arms, forces)
-        bodies = np.arange(len(self.tree.parent))[:, None]
-        incidence = (self.second == bodies).astype(float) - (self.first == bodies)
-        total = self.tree.sum_subtrees(incidence @ wrenches)
-        return jnp.sum(self.motion * (self.tree.has.T @ total), axis=1)
 
     def value(self, u: jax.Array) -> jax.Array:
         """s(u), summed over all contacts."""
@@ -172,42 +168,80 @@ class ContactRows(NamedTuple):
         first, second = jax.vmap(type(self.cone).slope_along)(self.cone, u, v)
         return jnp.sum(first), jnp.sum(second)
 
+    def _curvature(self, u: jax.Array) -> jax.Array:
+        """s''(u), `[n, k, k]`."""
+        return jax.vmap(type(self.cone).curvature)(self.cone, u)
+
+
+@dataclass(frozen=True)
+class GroundRows(ContactRows):
+    """Contacts of bodies with fixed ones, whose stiffness adds up like inertia.
+
+    Attributes:
+      tree: the tree of bodies.
+      motion: spatial velocity (angular, linear) per velocity of each degree of freedom, `[nv, 6]`.
+      bodies: those that move, `[n]`.
+      arms: components of u per spatial acceleration of the body, `[n, k, 6]`.
+    """
+
+    tree: BodySums
+    motion: jax.Array
+    bodies: np.ndarray
+    arms: jax.Array
+
+    def apply(self, velocity: jax.Array) -> jax.Array:
+        """J v, `[n, k]`."""
+        return _apply_arms(self.tree, self.motion, self.bodies, self.arms, velocity)
+
+    def pull(self, forces: jax.Array) -> jax.Array:
+        """J' w, `[nv]`."""
+        wrenches = jnp.einsum("nki,nk->ni", self.arms, forces)
+        total = self.tree.sum_subtrees(jnp.matmul(self._incidence, wrenches))
+        return jnp.sum(self.motion * (self.tree.has.T @ total), axis=1)
+
     def stiffen(self, u: jax.Array) -> jax.Array:
-        """J' s''(u) J, `[nv, nv]`.
-
-        A contact's stiffness as a spatial matrix is summed over all contacts of the same two bodies.
-        """
-        curvature = jax.vmap(type(self.cone).curvature)(self.cone, u)
-        turned = jnp.einsum("nkl,nlj->nkj", curvature, self.arms)
+        """J' s''(u) J, `[nv, nv]`: spatial matrices, summed up the tree."""
+        turned = jnp.einsum("nkl,nlj->nkj", self._curvature(u), self.arms)
         spatial = _mirror(jnp.einsum("nki,nkj->nij", self.arms, turned))
-        pairs, members = np.unique(np.stack([self.first, self.second]), axis=1, return_inverse=True)
-        stiffness = jnp.tensordot((members == np.arange(pairs.shape[1])[:, None]).astype(float), spatial, 1)
-        moves = self.tree.moves[pairs[1]] - self.tree.moves[pairs[0]]
-        is_alone = ~self.tree.moves[pairs].any(axis=2).all(axis=0)  # the other body is fixed
-        hessian = self._stiffen_trees(stiffness[is_alone], pairs.max(axis=0)[is_alone])
-        for one, own in zip(stiffness[~is_alone], moves[~is_alone], strict=True):
-            hessian = hessian + self._stiffen_pair(one, own)
-        return hessian
-
-    def _stiffen_trees(self, stiffness: jax.Array, bodies: np.ndarray) -> jax.Array:
-        """The part of contacts with fixed bodies, whose stiffness adds up like inertia: `[n, 6, 6]` -> `[nv, nv]`."""
-        members = (bodies == np.arange(len(self.tree.parent))[:, None]).astype(float)
-        total = self.tree.sum_subtrees(jnp.tensordot(members, stiffness, 1))
+        total = self.tree.sum_subtrees(jnp.tensordot(self._incidence, spatial, 1))
         carried = jnp.einsum("vij,vj->vi", jnp.tensordot(self.tree.has.T, total, 1), self.motion)
         below = np.tril(self.tree.has.T @ self.tree.moves > 0)  # the first moves the body of the second
-        lower = jnp.where(below, carried @ self.motion.T, 0.0)
-        return _mirror(lower.T)
+        return _mirror(jnp.where(below, carried @ self.motion.T, 0.0).T)
 
-    def _stiffen_pair(self, stiffness: jax.Array, moves: np.ndarray) -> jax.Array:
-        """The part of two bodies that both move, relative to each other by `moves` of 1, 0 and -1: `[nv, nv]`."""
-        motion = self.motion * moves[:, None]
-        return _mirror(motion @ (motion @ stiffness).T)
+    @property
+    def _incidence(self) -> np.ndarray:
+        """1 for a body and its contacts, else 0, `[nbody, n]`."""
+        return (self.bodies == np.arange(len(self.tree.parent))[:, None]).astype(float)
 
 
-def _find_relative(tree: BodySums, motion, first: np.ndarray, second: np.ndarray, arms, velocity) -> jax.Array:
-    """Components of the relative velocity at each contact, `[n, k]`; the arguments are those of `ContactRows`."""
+@dataclass(frozen=True)
+class CouplingRows(ContactRows):
+    """Contacts of bodies that both move, by the Jacobian, most of which is structural zeros.
+
+    Attributes:
+      jacobian: J, `[n, k, nv]`.
+    """
+
+    jacobian: jax.Array
+
+    def apply(self, velocity: jax.Array) -> jax.Array:
+        """J v, `[n, k]`."""
+        return self.jacobian @ velocity
+
+    def pull(self, forces: jax.Array) -> jax.Array:
+        """J' w, `[nv]`."""
+        return jnp.einsum("nkv,nk->v", self.jacobian, forces)
+
+    def stiffen(self, u: jax.Array) -> jax.Array:
+        """J' s''(u) J, `[nv, nv]`."""
+        turned = jnp.einsum("nkl,nlv->nkv", self._curvature(u), self.jacobian)
+        return _mirror(jnp.einsum("nkv,nkw->vw", self.jacobian, turned))
+
+
+def _apply_arms(tree: BodySums, motion, bodies: np.ndarray, arms, velocity) -> jax.Array:
+    """Components of the bodies' acceleration at each contact, `[n, k]`; the arguments are those of `GroundRows`."""
     spatial = tree.sum_paths(jnp.matmul(tree.has, motion * velocity[:, None]))
-    return jnp.einsum("nki,ni->nk", arms, spatial[second] - spatial[first])
+    return jnp.einsum("nki,ni->nk", arms, spatial[bodies])
 
 
 def _mirror(matrix: jax.Array) -> jax.Array:
@@ -230,10 +264,37 @@ def find_origin(model: mujoco.MjModel, d: mjx.Data) -> jax.Array:
     return d.xpos[model.body_rootid[model.dof_bodyid[0]]]
 
 
-def make_contact_rows(model: mujoco.MjModel, mx: mjx.Model, d: mjx.Data, contact: Contact, condim: int) -> ContactRows:
-    """The contacts of one dimension as a group of constraints."""
-    arms = _find_arms(contact, find_origin(model, d), condim)
-    parts = BodySums(model), find_spatial_axes(model, d), contact.first, contact.second, arms
+def make_contact_rows(
+    model: mujoco.MjModel, mx: mjx.Model, d: mjx.Data, contact: Contact, condim: int
+) -> list[tuple[Contact, GroundRows | CouplingRows]]:
+    """The contacts of one dimension as groups of constraints: those with fixed bodies, and the others."""
+    tree = BodySums(model)
+    is_ground = ~tree.moves[np.stack([contact.first, contact.second])].any(axis=2).all(axis=0)
+    groups = []
+    for maker, members in ((_make_ground_rows, is_ground), (_make_coupling_rows, ~is_ground)):
+        if members.any():
+            part = contact._make(x[members] for x in contact)
+            groups.append((part, maker(model, mx, d, part, condim, tree)))
+    return groups
+
+
+def _make_ground_rows(model, mx, d, contact: Contact, condim: int, tree: BodySums) -> GroundRows:
+    is_second = tree.moves[contact.second].any(axis=1)
+    bodies, sign = np.where(is_second, contact.second, contact.first), np.where(is_second, 1.0, -1.0)
+    arms = jnp.asarray(sign)[:, None, None] * find_arms(contact, find_origin(model, d), condim)
+    parts = tree, find_spatial_axes(model, d), bodies, arms
+    return GroundRows(*_find_spring(model, mx, contact, condim, _apply_arms(*parts, d.qvel)), *parts)
+
+
+def _make_coupling_rows(model, mx, d, contact: Contact, condim: int, tree: BodySums) -> CouplingRows:
+    moves = tree.moves[contact.second] - tree.moves[contact.first]
+    arms = find_arms(contact, find_origin(model, d), condim)
+    jacobian = jnp.einsum("nki,vi->nkv", arms, find_spatial_axes(model, d)) * moves[:, None]
+    return CouplingRows(*_find_spring(model, mx, contact, condim, jacobian @ d.qvel), jacobian)
+
+
+def _find_spring(model, mx, contact: Contact, condim: int, velocity: jax.Array) -> tuple[jax.Array, Cone]:
+    """(r, s) of contacts whose bodies have this relative velocity, `[n, k]`."""
     position = contact.distance - contact.margin
     stiffness, damping, impedance = find_impedance(model, mx, contact.solref, contact.solimp, position)
     dampings = jnp.repeat(damping[:, None], condim, axis=1)
@@ -250,10 +311,10 @@ def make_contact_rows(model: mujoco.MjModel, mx: mjx.Model, d: mjx.Data, contact
     cone = jax.vmap((Ellipse if is_elliptic else Pyramid).make, (0, 0, 0, None))(
         regularization, contact.friction[:, : condim - 1], position < 0, get_number(model, mx, "opt.impratio")
     )
-    return ContactRows(*parts, -dampings * _find_relative(*parts, d.qvel) - spring, cone)
+    return -dampings * velocity - spring, cone
 
 
-def _find_arms(contact: Contact, origin: jax.Array, condim: int) -> jax.Array:
+def find_arms(contact: Contact, origin: jax.Array, condim: int) -> jax.Array:
     """Components of the acceleration at a contact per spatial acceleration (angular, linear), `[n, k, 6]`."""
     lever = (contact.position - origin)[:, None]
     axes, spins = contact.frame[:, : min(condim, 3)], contact.frame[:, : max(condim - 3, 0)]

@@ -39,7 +39,7 @@ def find_passive_forces(model: mujoco.MjModel, mx: mjx.Model, d: mjx.Data, smoot
     if model.ntendon:
         force = force + contract(find_tendon_forces(model, mx, d, smooth), smooth.tendon_jacobian)
     if has_fluid(model, mx):
-        force = force + _find_fluid_forces(model, mx, d, smooth)
+        force = force + find_fluid_forces(model, mx, d, smooth)
     return force, find_gravity_compensation(model, mx, d)
 
 
@@ -51,7 +51,7 @@ def evaluate_coefficient(linear, higher, x, derivative: bool = False):
 
     Args:
       linear: k_0 [n].
-      higher: k_1, k_2, ... [n, number], numpy.
+      higher: k_1, k_2, ... [n, number].
       x: [n].
       derivative: whether the derivative is meant.
 
@@ -60,7 +60,7 @@ def evaluate_coefficient(linear, higher, x, derivative: bool = False):
     """
     power = 1.0
     for i in range(higher.shape[-1]):
-        if not np.any(higher[:, i:]):
+        if is_zero(higher[:, i:]):
             break
         power = power * x
         linear = linear + (i + 2 if derivative else 1) * higher[:, i] * power
@@ -69,11 +69,11 @@ def evaluate_coefficient(linear, higher, x, derivative: bool = False):
 
 def _find_springs(model, mx, d: mjx.Data):
     """Forces of the joints' springs [nv]."""
-    stiffness, higher = get_number(model, mx, "jnt_stiffness"), np.array(model.jnt_stiffnesspoly)
+    stiffness, higher = get_number(model, mx, "jnt_stiffness"), get_number(model, mx, "jnt_stiffnesspoly")
     rest = get_number(model, mx, "qpos_spring")
     force = np.zeros(model.nv)
     scalar = ~np.isin(model.jnt_type, (FREE, BALL))
-    stiff = np.ones(model.njnt, bool) if is_traced(stiffness) else (stiffness != 0) | higher.any(-1)
+    stiff = np.ones(model.njnt, bool) if is_traced(stiffness, higher) else (stiffness != 0) | higher.any(-1)
     (joints,) = np.nonzero(scalar & stiff)
     if joints.size:
         q = model.jnt_qposadr[joints]
@@ -99,65 +99,56 @@ def _spread(values, places: np.ndarray, size: int):
 
 def _pull_back(stiffness, higher, shift):
     """-k(|x|) x."""
-    return -shift * evaluate_coefficient(stiffness, higher, length(shift)[None] if higher.any() else 0.0)
+    return -shift * evaluate_coefficient(stiffness, higher, 0.0 if is_zero(higher) else length(shift)[None])
 
 
 def find_tendon_forces(model: mujoco.MjModel, mx: mjx.Model, d: mjx.Data, smooth: Smooth):
     """Forces of the tendons' springs, which have a dead band, and dampers, by which they would get longer [ntendon]."""
     force = np.zeros(model.ntendon)
-    stiffness, higher = get_number(model, mx, "tendon_stiffness"), np.array(model.tendon_stiffnesspoly)
-    if not is_disabled(model, DISABLED.SPRING) and not (is_zero(stiffness) and not higher.any()):
+    stiffness, higher = get_number(model, mx, "tendon_stiffness"), get_number(model, mx, "tendon_stiffnesspoly")
+    if not is_disabled(model, DISABLED.SPRING) and not (is_zero(stiffness) and is_zero(higher)):
         low, high = get_number(model, mx, "tendon_lengthspring").T
         x = jnp.maximum(d.ten_length - high, 0.0) + jnp.minimum(d.ten_length - low, 0.0)
         force = force - x * evaluate_coefficient(stiffness, higher, x)
     damping, higher = find_tendon_damping(model, mx)
-    if not is_disabled(model, DISABLED.DAMPER) and not (is_zero(damping) and not higher.any()):
+    if not is_disabled(model, DISABLED.DAMPER) and not (is_zero(damping) and is_zero(higher)):
         v = smooth.tendon_velocity
         force = force - v * evaluate_coefficient(damping, higher, jnp.abs(v))
     return force
 
 
-def find_joint_damping(model: mujoco.MjModel, mx: mjx.Model) -> tuple[Any, np.ndarray]:
+def find_joint_damping(model: mujoco.MjModel, mx: mjx.Model) -> tuple[Any, Any]:
     """Damping of the velocities, with that of actuators at their joints: (linear [nv], higher [nv, number])."""
-    linear, higher = get_number(model, mx, "dof_damping"), np.array(model.dof_dampingpoly)
-    for dof, joint in enumerate(model.dof_jntid):
-        if model.jnt_actuatorid[joint] != -1:
-            more, poly = _find_actuator_damping(model, JOINT_TRANSMISSIONS, joint)
-            linear = linear + more * (np.arange(model.nv) == dof)
-            higher[dof] += poly
-    return linear, higher
+    return _find_damping(model, mx, "dof")
 
 
-def find_tendon_damping(model: mujoco.MjModel, mx: mjx.Model) -> tuple[Any, np.ndarray]:
+def find_tendon_damping(model: mujoco.MjModel, mx: mjx.Model) -> tuple[Any, Any]:
     """Damping of the tendons, with that of actuators at them: (linear [ntendon], higher [ntendon, number])."""
-    linear, higher = get_number(model, mx, "tendon_damping"), np.array(model.tendon_dampingpoly)
-    for tendon in range(model.ntendon):
-        if model.tendon_actuatorid[tendon] != -1:
-            more, poly = _find_actuator_damping(model, (TRANSMISSION.TENDON,), tendon)
-            linear = linear + more * (np.arange(model.ntendon) == tendon)
-            higher[tendon] += poly
-    return linear, higher
+    return _find_damping(model, mx, "tendon")
 
 
-def _find_actuator_damping(model, transmissions, target: int) -> tuple[float, np.ndarray]:
-    """Damping coefficients of the actuators at a joint or a tendon."""
-    here = np.isin(model.actuator_trntype, transmissions) & (model.actuator_trnid[:, 0] == target)
-    square = here * model.actuator_gear[:, 0] ** 2
-    return square @ model.actuator_damping, square @ model.actuator_dampingpoly
+def _find_damping(model, mx, kind: str) -> tuple[Any, Any]:
+    linear, higher = get_number(model, mx, f"{kind}_damping"), get_number(model, mx, f"{kind}_dampingpoly")
+    if not (model.actuator_damping.any() or model.actuator_dampingpoly.any()):
+        return linear, higher
+    share = _find_shares(model, mx, kind)
+    return linear + contract(share, model.actuator_damping), higher + contract(share, model.actuator_dampingpoly)
 
 
 def find_armature(model: mujoco.MjModel, mx: mjx.Model, kind: str):
     """Armature of the velocities (kind="dof") or the tendons (kind="tendon"), with that of actuators at them."""
     armature = get_number(model, mx, f"{kind}_armature")
+    if not model.actuator_armature.any():
+        return armature
+    return armature + contract(_find_shares(model, mx, kind), model.actuator_armature)
+
+
+def _find_shares(model, mx, kind: str):
+    """The squared gears of the actuators at velocities (kind="dof") or tendons (kind="tendon") [n, nu]."""
     targets = model.dof_jntid if kind == "dof" else np.arange(model.ntendon)
-    own = model.jnt_actuatorid if kind == "dof" else model.tendon_actuatorid
     transmissions = JOINT_TRANSMISSIONS if kind == "dof" else (TRANSMISSION.TENDON,)
-    more = np.zeros(len(targets))
-    for i, target in enumerate(targets):
-        if own[target] != -1:
-            here = np.isin(model.actuator_trntype, transmissions) & (model.actuator_trnid[:, 0] == target)
-            more[i] = (here * model.actuator_gear[:, 0] ** 2) @ model.actuator_armature
-    return armature + more if more.any() else armature
+    here = np.isin(model.actuator_trntype, transmissions) & (model.actuator_trnid[:, 0] == targets[:, None])
+    return here * get_number(model, mx, "actuator_gear")[:, 0] ** 2
 
 
 def _find_dampers(model, mx, d: mjx.Data):
@@ -191,7 +182,7 @@ def has_fluid(model: mujoco.MjModel, mx: mjx.Model) -> bool:
     return not (is_zero(get_number(model, mx, "opt.density")) and is_zero(get_number(model, mx, "opt.viscosity")))
 
 
-def _find_fluid_forces(model, mx, d: mjx.Data, smooth: Smooth):
+def find_fluid_forces(model, mx, d: mjx.Data, smooth: Smooth):
     """Drag and viscous forces on the boxes of the bodies' inertia [nv]."""
     rows, velocity, linear, quadratic = _find_drag(model, mx, d, smooth)
     force = linear * velocity + quadratic * jnp.abs(velocity) * velocity
@@ -249,11 +240,11 @@ def find_passive_derivative(model: mujoco.MjModel, mx: mjx.Model, d: mjx.Data, s
     if is_disabled(model, DISABLED.DAMPER):
         return result
     linear, higher = find_joint_damping(model, mx)
-    if not (is_zero(linear) and not higher.any()):
+    if not (is_zero(linear) and is_zero(higher)):
         slope = evaluate_coefficient(linear, higher, jnp.abs(d.qvel), derivative=True)
         result = result - slope * np.eye(model.nv)
     linear, higher = find_tendon_damping(model, mx)
-    if not model.ntendon or (is_zero(linear) and not higher.any()):
+    if not model.ntendon or (is_zero(linear) and is_zero(higher)):
         return result
     slope = evaluate_coefficient(linear, higher, jnp.abs(smooth.tendon_velocity), derivative=True)
     return result - contract(smooth.tendon_jacobian.T * slope, smooth.tendon_jacobian)

@@ -11,14 +11,21 @@ import numpy as np
 
 from envs.physics.dynamics.actuators import add_actuator_forces, is_idle
 from envs.physics.dynamics.codes import DISABLED, INTEGRATOR, WRAP
-from envs.physics.dynamics.forces import compensates_gravity, find_armature, find_passive_forces, is_disabled
+from envs.physics.dynamics.forces import (
+    compensates_gravity,
+    find_armature,
+    find_fluid_forces,
+    find_passive_forces,
+    has_fluid,
+    is_disabled,
+)
 from envs.physics.dynamics.integrators import advance, find_coupled, find_integrated_acceleration, step_rk4
 from envs.physics.dynamics.kinematics import add_fields, find_jacobians, place_bodies
 from envs.physics.dynamics.linear_algebra import solve
 from envs.physics.dynamics.newton_euler import find_bias, find_mass_matrix, find_poses
 from envs.physics.dynamics.numbers import get_number, is_traced, is_zero
 from envs.physics.dynamics.rotations import contract
-from envs.physics.dynamics.sensors import read_sensors
+from envs.physics.dynamics.sensors import add_readings
 from envs.physics.dynamics.smooth import Smooth
 from envs.physics.dynamics.transmissions import find_tendon_rates, find_tendons, find_transmissions
 from envs.physics.dynamics.tree import make_tree
@@ -26,6 +33,8 @@ from envs.physics.dynamics.tree import make_tree
 if TYPE_CHECKING:
     from mujoco import mjx
 
+# Fields of the state before a step that are not those of the last stage of RK4.
+READINGS = ("sensordata", "energy", "cfrc_ext")
 # (model, mx, d, smooth) -> (qacc [nv], qfrc_constraint [nv])
 Solver = Callable[..., tuple]
 
@@ -35,9 +44,7 @@ def unconstrained(model: mujoco.MjModel, mx: mjx.Model, d: mjx.Data, smooth: Smo
     return d.qacc_smooth, jnp.zeros(model.nv)
 
 
-def forward(
-    model: mujoco.MjModel, mx: mjx.Model, d: mjx.Data, solve: Solver, sense: Callable | None = None, also=()
-) -> mjx.Data:
+def forward(model: mujoco.MjModel, mx: mjx.Model, d: mjx.Data, solve: Solver, also=()) -> mjx.Data:
     """Everything that follows from a state and controls, as by `mj_forward`.
 
     Args:
@@ -46,51 +53,49 @@ def forward(
       d: with time, qpos, qvel, act, ctrl, mocap poses and applied forces.
       solve: (model, mx, d, smooth) -> (qacc [nv], qfrc_constraint [nv]), where d has the poses of all bodies, tendons,
         qfrc_smooth and qacc_smooth; `unconstrained`, for example.
-      sense: (model, mx, d) -> {sensor: values}, the sensors that need constraints; see `read_sensors`.
-      also: names of fields to compute that no force needs: cdof, cvel, cam_xpos, cam_xmat.
+      also: names of fields to compute that no force needs: those of `add_fields`, and others that read the result. With
+        the fields of `fields.ADDED` among them, d is a `data.Data`.
 
     Returns:
       The data.
     """
-    return evaluate(model, mx, d, solve, sense, also)[0]
+    return evaluate(model, mx, d, solve, also)[0]
 
 
-def step(
-    model: mujoco.MjModel, mx: mjx.Model, d: mjx.Data, solve: Solver, sense: Callable | None = None, also=()
-) -> mjx.Data:
+def step(model: mujoco.MjModel, mx: mjx.Model, d: mjx.Data, solve: Solver, also=()) -> mjx.Data:
     """The data after one time step with the model's integrator, as by `mj_step`; arguments as of `forward`."""
-    return step_with_flag(model, mx, d, solve, sense, also)[0]
+    return step_with_flag(model, mx, d, solve, also)[0]
 
 
-def step_with_flag(
-    model, mx, d: mjx.Data, solve: Solver, sense: Callable | None = None, also=(), written_out: bool = True
-):
+def step_with_flag(model, mx, d: mjx.Data, solve: Solver, also=(), written_out: bool = True):
     """The data after one time step, and the largest `Smooth.flag` of its evaluations.
 
     Args:
-      model, mx, d, solve, sense, also: as of `forward`.
+      model, mx, d, solve, also: as of `forward`.
       written_out: as of `step_rk4`.
     """
     if model.opt.integrator == INTEGRATOR.RK4:
+        stage_fields = [name for name in also if name not in READINGS]
 
         def find_rates(stage):
-            stage, smooth = evaluate(model, mx, stage, solve, None, also, False)
+            stage, smooth = evaluate(model, mx, stage, solve, stage_fields, False)
             return stage, smooth.flag
 
-        sensed = evaluate(model, mx, d, solve, sense, also)[0] if model.nsensor else d
+        read = [name for name in READINGS if name == "sensordata" or name in also]
+        first = evaluate(model, mx, d, solve, also)[0] if model.nsensor or len(read) > 1 else d
         d, flag = step_rk4(model, mx, d, find_rates, written_out)
-        return d.replace(sensordata=sensed.sensordata), flag
-    d, smooth = evaluate(model, mx, d, solve, sense, also)
+        return d.replace(**{name: getattr(first, name) for name in read}), flag
+    d, smooth = evaluate(model, mx, d, solve, also)
     return advance(model, mx, d, find_integrated_acceleration(model, mx, d, smooth), d.act_dot), smooth.flag
 
 
-def evaluate(
-    model, mx, d: mjx.Data, find_solution: Solver, sense: Callable | None = None, also=(), sensors: bool = True
-):
+def evaluate(model, mx, d: mjx.Data, find_solution: Solver, also=(), sensors: bool = True):
     """The data of `forward`, and what the integrator needs besides."""
     d, smooth = find_positions(model, mx, d)
     d = add_fields(model, mx, d, smooth.tree, smooth.poses, also) if also else d
     others, gravcomp = find_passive_forces(model, mx, d, smooth)
+    if "qfrc_fluid" in also and has_fluid(model, mx) and not is_disabled(model, DISABLED.SPRING, DISABLED.DAMPER):
+        d = d.replace(qfrc_fluid=find_fluid_forces(model, mx, d, smooth))
     by_actuators = model.jnt_actgravcomp[model.dof_jntid].astype(bool)
     passive, bias = others + jnp.where(by_actuators, 0.0, gravcomp), _find_bias(model, mx, d, smooth)
     d = d.replace(qfrc_passive=jnp.asarray(passive), qfrc_gravcomp=jnp.asarray(gravcomp), qfrc_bias=bias)
@@ -102,11 +107,47 @@ def evaluate(
     d = d.replace(qacc_smooth=solve(smooth.mass, d.qfrc_smooth))
     qacc, constraint = find_solution(model, mx, d, smooth)
     d = d.replace(qacc=qacc, qfrc_constraint=constraint)
-    return (read_sensors(model, mx, d, smooth, sense) if sensors else d), smooth
+    return add_readings(model, mx, d, smooth, also, sensors), smooth
+
+
+def find_inverse(model: mujoco.MjModel, mx: mjx.Model, d: mjx.Data, smooth: Smooth):
+    """The force that makes qacc, besides those of springs, dampers, fluids and constraints, as by `mj_inverse` [nv]."""
+    force = _find_bias(model, mx, d, smooth, qacc=d.qacc) + find_armature(model, mx, "dof") * d.qacc
+    armature = find_armature(model, mx, "tendon")
+    if not is_zero(armature):
+        J = smooth.tendon_jacobian
+        force = force + contract(jnp.where(find_coupled(model), contract(J.T * armature, J), 0.0), d.qacc)
+    return force - d.qfrc_passive - d.qfrc_constraint
+
+
+def find_kinematics(model: mujoco.MjModel, mx: mjx.Model, d: mjx.Data, also=()) -> mjx.Data:
+    """The data with poses, and with those fields of `fields.KINEMATICS` that are named; from positions alone."""
+    tree = make_tree(model, mx, d)
+    poses = find_poses(tree, d.qpos, get_number(model, mx, "qpos0"))
+    d = place_bodies(model, mx, d, tree, poses)
+    if "ten_length" in also and model.ntendon:
+        d = d.replace(ten_length=find_tendons(model, mx, d)[0])
+    return add_fields(model, mx, d, tree, poses, also)
 
 
 def find_positions(model: mujoco.MjModel, mx: mjx.Model, d: mjx.Data) -> tuple[mjx.Data, Smooth]:
     """The data with poses and lengths, and the quantities between the state and the forces."""
+    d, tree, poses, mass, J = find_inertia(model, mx, d)
+    moment = np.zeros((0, model.nv))
+    if model.nu:
+        lengths, moment = find_transmissions(model, mx, d, J)
+        d = d.replace(actuator_length=lengths)
+    speeds = contract(moment, d.qvel) * (0.0 if is_idle(model) else 1.0)
+    return d, Smooth(tree, poses, mass, J, contract(J, d.qvel), moment, speeds)
+
+
+def find_inertia(model: mujoco.MjModel, mx: mjx.Model, d: mjx.Data):
+    """The data with poses and the lengths of tendons, and what the mass matrix follows from.
+
+    Returns:
+      (data, links, their poses relative to their parents, mass matrix with armatures [nv, nv], derivatives of the
+      tendons' lengths [ntendon, nv]).
+    """
     tree = make_tree(model, mx, d)
     poses = find_poses(tree, d.qpos, get_number(model, mx, "qpos0"))
     d = place_bodies(model, mx, d, tree, poses)
@@ -118,19 +159,14 @@ def find_positions(model: mujoco.MjModel, mx: mjx.Model, d: mjx.Data) -> tuple[m
         armature = find_armature(model, mx, "tendon")
         if not is_zero(armature):
             mass = mass + jnp.where(find_coupled(model), contract(J.T * armature, J), 0.0)
-    moment = np.zeros((0, model.nv))
-    if model.nu:
-        lengths, moment = find_transmissions(model, mx, d, J)
-        d = d.replace(actuator_length=lengths)
-    speeds = contract(moment, d.qvel) * (0.0 if is_idle(model) else 1.0)
-    return d, Smooth(tree, poses, mass, J, contract(J, d.qvel), moment, speeds)
+    return d, tree, poses, mass, J
 
 
-def _find_bias(model, mx, d: mjx.Data, smooth: Smooth, compensated: bool = False):
-    """Coriolis, centrifugal and gravitational forces, with those of the tendons' armature [nv]."""
+def _find_bias(model, mx, d: mjx.Data, smooth: Smooth, compensated: bool = False, qacc=None):
+    """Coriolis, centrifugal and gravitational forces, with those of the tendons' armature [nv]; and M qacc."""
     off = is_disabled(model, DISABLED.GRAVITY)
     gravity = np.zeros(3) if off else get_number(model, mx, "opt.gravity")
-    bias = find_bias(smooth.tree, smooth.poses, d.qvel, gravity, compensated)
+    bias = find_bias(smooth.tree, smooth.poses, d.qvel, gravity, compensated, qacc)
     armature = find_armature(model, mx, "tendon")
     if is_zero(armature) or not (model.wrap_type == WRAP.SITE).any():
         return bias

@@ -48,7 +48,7 @@ def find_integrated_acceleration(model: mujoco.MjModel, mx: mjx.Model, d: mjx.Da
 def _find_euler(model, mx, d: mjx.Data, smooth: Smooth):
     """(M + h B)^-1 (M qacc), B the derivative of the joints' damping; qacc if there is none."""
     linear, higher = find_joint_damping(model, mx)
-    undamped = is_zero(linear) and not higher.any()
+    undamped = is_zero(linear) and is_zero(higher)
     if undamped or is_disabled(model, DISABLED.EULERDAMP) or is_disabled(model, DISABLED.DAMPER):
         return d.qacc
     slope = evaluate_coefficient(linear, higher, jnp.abs(d.qvel), derivative=True)

@@ -26,6 +26,7 @@ from envs.physics.dynamics.rotations import (
     turn,
 )
 from envs.physics.dynamics.tree import BALL, FREE, HINGE, SLIDE, WORLD, Tree
+from envs.physics.models import import_mjx
 
 if TYPE_CHECKING:
     from mujoco import mjx
@@ -110,10 +111,14 @@ def find_carried(model: mujoco.MjModel) -> np.ndarray:
 
 
 def _place_joints(model, d, tree: Tree, axes, points, qpos0, pos):
-    """The data with the joints' anchors and axes in the world; a ball's axis is fixed to its body."""
+    """The data with the joints' anchors and axes in the world; a ball's axis does not turn with it."""
     moved = np.arange(1, len(tree.links) + 1)
     local = _stack([link.axis for link in tree.links])
     axis = rotate_each(axes[moved], local)
+    if (model.jnt_type == BALL).any():
+        before = np.array([link.parent + 1 for link in tree.links])
+        still = rotate_each(jnp.matmul(axes[before], _stack([link.rotation for link in tree.links])), local)
+        axis = jnp.where((model.jnt_type == BALL)[:, None], still, axis)
     axis = jnp.where((model.jnt_type == FREE)[:, None], local, axis)
     anchor = points[moved]
     slides = model.jnt_type == SLIDE
@@ -224,16 +229,22 @@ def add_axes(model: mujoco.MjModel, d: mjx.Data) -> mjx.Data:
 
 
 def add_fields(model: mujoco.MjModel, mx: mjx.Model, d: mjx.Data, tree: Tree, poses: list[tuple], names) -> mjx.Data:
-    """The data with those of the fields cdof, cvel, cam_xpos and cam_xmat that are named, which no force needs."""
-    d = add_axes(model, d) if "cdof" in names else d
+    """The data with those fields that are named and that no force needs: of cameras, velocities and Jacobians."""
+    d = add_axes(model, d) if {"cdof", "cdof_dot"} & set(names) else d
     if "cvel" in names:
         center = d.subtree_com[model.body_rootid]
         spin, velocity = find_body_velocities(tree, poses, d)
         d = d.replace(cvel=jnp.concatenate([spin, velocity + cross_each(spin, center - d.xpos)], 1))
     if {"cam_xpos", "cam_xmat"} & set(names):
-        from envs.physics.models import import_mjx
-
-        d = import_mjx().camlight(mx, d)
+        other = import_mjx().camlight(mx, d)
+        d = d.replace(cam_xpos=other.cam_xpos, cam_xmat=other.cam_xmat)
+    if "cdof_dot" in names:
+        d = d.replace(cdof_dot=import_mjx().com_vel(mx, d).cdof_dot)
+    frames = {"site": (d.site_xpos, model.site_bodyid), "body": (d.xpos, np.arange(model.nbody))}
+    for kind, (points, bodies) in frames.items():
+        if {f"{kind}_jacp", f"{kind}_jacr"} & set(names):
+            jacobians = (J.swapaxes(1, 2) for J in find_jacobians(model, d, points, bodies))
+            d = d.replace(**dict(zip((f"{kind}_jacp", f"{kind}_jacr"), jacobians, strict=True)))
     return d
 
 

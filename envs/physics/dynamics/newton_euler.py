@@ -55,8 +55,8 @@ def _turn(link: Link, angle):
 # --- bias force -------------------------------------------------------------------------------------------------------
 
 
-def find_bias(tree: Tree, poses: list[tuple], qvel, gravity, compensated: bool = False):
-    """The force that keeps qacc = 0, without armature of tendons: the recursive Newton-Euler method.
+def find_bias(tree: Tree, poses: list[tuple], qvel, gravity, compensated: bool = False, qacc=None):
+    """The force that makes an acceleration, without armature: the recursive Newton-Euler method.
 
     Args:
       tree: the links.
@@ -64,11 +64,12 @@ def find_bias(tree: Tree, poses: list[tuple], qvel, gravity, compensated: bool =
       qvel: velocities [nv].
       gravity: acceleration [3], m/s^2.
       compensated: whether the bodies' gravity compensation is taken off.
+      qacc: the acceleration [nv]; None for 0.
 
     Returns:
-      qfrc_bias [nv].
+      M qacc + qfrc_bias [nv].
     """
-    motions = find_motions(tree, poses, qvel, np.zeros(3) if compensated else gravity)
+    motions = find_motions(tree, poses, qvel, np.zeros(3) if compensated else gravity, qacc)
     forces = [find_force(link, x.turning, x.acceleration) for link, x in zip(tree.links, motions, strict=True)]
     if compensated:
         forces = _add_weights(tree, poses, forces, gravity)

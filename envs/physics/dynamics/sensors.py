@@ -3,17 +3,20 @@
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable
-from typing import TYPE_CHECKING
+from collections.abc import Collection
+from typing import TYPE_CHECKING, Any
 
 import jax.numpy as jnp
 import mujoco
 import numpy as np
 
 from envs.physics.dynamics.codes import DATA, DISABLED, OBJECT, SENSOR, TRANSMISSION
+from envs.physics.dynamics.contact_sensors import read_contact, read_touch
 from envs.physics.dynamics.forces import find_armature, find_tendon_forces, is_disabled
 from envs.physics.dynamics.kinematics import find_accelerations, find_body_velocities, find_carried, find_carriers
 from envs.physics.dynamics.numbers import SMALL, get_number, is_zero
+from envs.physics.dynamics.rays import MISS, find_distance, is_inside
+from envs.physics.dynamics.reactions import Reactions
 from envs.physics.dynamics.rotations import (
     IDENTITY,
     conjugate,
@@ -28,51 +31,60 @@ from envs.physics.dynamics.rotations import (
 from envs.physics.dynamics.smooth import Smooth
 from envs.physics.dynamics.transmissions import find_tendon_pulls, find_tendon_rates
 from envs.physics.dynamics.tree import BALL, FREE
+from envs.physics.fields import find_outputs
+from envs.physics.models import import_mjx
+from envs.physics.pairs import SHAPES
 
 if TYPE_CHECKING:
     from mujoco import mjx
-
-# Sensors that read the rows and forces of constraints.
+# Sensors that depend on the constraints.
 OF_CONSTRAINTS = frozenset(
     getattr(SENSOR, name)
     for name in (
         "TOUCH", "CONTACT", "JOINTLIMITPOS", "JOINTLIMITVEL", "JOINTLIMITFRC", "TENDONLIMITPOS", "TENDONLIMITVEL",
-        "TENDONLIMITFRC",
+        "TENDONLIMITFRC", "ACCELEROMETER", "FORCE", "TORQUE", "FRAMELINACC", "FRAMEANGACC",
     )
 )  # fmt: skip
+JOINT_LIMITS = [SENSOR.JOINTLIMITPOS, SENSOR.JOINTLIMITVEL, SENSOR.JOINTLIMITFRC]
+TENDON_LIMITS = [SENSOR.TENDONLIMITPOS, SENSOR.TENDONLIMITVEL, SENSOR.TENDONLIMITFRC]
 
 
-def read_sensors(
-    model: mujoco.MjModel, mx: mjx.Model, d: mjx.Data, smooth: Smooth, sense: Callable | None = None
-) -> mjx.Data:
-    """The data with sensordata.
+def list_sensors(model: mujoco.MjModel, outputs: Collection[str]) -> list[int]:
+    """The types of the sensors whose values are among the outputs."""
+    places = [place for field, place in find_outputs(model, outputs) if field == "sensordata"]
+    if any(place is None for place in places):
+        return model.sensor_type.tolist()
+    begins = [place.start for place in places if isinstance(place, slice)]
+    return model.sensor_type[np.isin(model.sensor_adr, begins)].tolist()
+
+
+def add_readings(model: mujoco.MjModel, mx: mjx.Model, d: Any, smooth: Smooth, names=(), sensors: bool = True) -> Any:
+    """The data with sensordata, and with those of the fields energy and cfrc_ext that are named.
 
     Args:
       model: the model.
       mx: its numbers.
       d: with everything else.
-      smooth: what the forces are made from.
-      sense: (model, mx, d) -> {sensor: values [dim]} for those sensors that read constraints (`OF_CONSTRAINTS`), and
-        under the key "external" the forces and torques about the world's origin that contacts and equalities exert on
-        the bodies, ([nbody, 3], [nbody, 3]). Without it these are 0.
-
-    Returns:
-      The data; sensors of kinds that are not supported stay 0.
+      smooth: what the forces are made from; without its `constraints`, sensors that read them are 0.
+      names: fields to compute.
+      sensors: whether to read the sensors, of which kinds that are not supported stay 0.
     """
-    if not model.nsensor or is_disabled(model, DISABLED.SENSOR):
-        return d
-    given = sense(model, mx, d) if sense is not None else {}
-    reader = _Reader(model, mx, d, smooth, given.get("external"))
-    values = []
-    for sensor in range(model.nsensor):
-        dim = int(model.sensor_dim[sensor])
-        read = READERS.get(int(model.sensor_type[sensor]))
-        if sensor in given:
-            value = given[sensor]
-        else:
-            value = jnp.zeros(dim) if read is None else jnp.reshape(read(reader, sensor), dim)
-        values.append(_cut_off(model, sensor, value))
-    return d.replace(sensordata=jnp.concatenate(values))
+    reader = _Reader(model, mx, d, smooth)
+    if sensors and model.nsensor and not is_disabled(model, DISABLED.SENSOR):
+        d = d.replace(sensordata=jnp.concatenate([_read(reader, sensor) for sensor in range(model.nsensor)]))
+    if "energy" in names:
+        d = d.replace(energy=jnp.stack([_read_potential_energy(reader, -1), _read_kinetic_energy(reader, -1)]))
+    if "cfrc_ext" in names:
+        d = d.replace(cfrc_ext=_read_outer_forces(reader))
+    return d
+
+
+def _read(reader: _Reader, sensor: int):
+    """The values of a sensor."""
+    model = reader.model
+    dim, read = int(model.sensor_dim[sensor]), READERS.get(int(model.sensor_type[sensor]))
+    value = jnp.zeros(dim) if read is None else jnp.reshape(jnp.asarray(read(reader, sensor)), dim)
+    return _cut_off(model, sensor, value)
 
 
 def _cut_off(model, sensor: int, value):
@@ -88,11 +100,19 @@ def _cut_off(model, sensor: int, value):
 class _Reader:
     """What the sensors of one evaluation share, computed when the first sensor needs it."""
 
-    def __init__(self, model, mx, d, smooth: Smooth, external):
-        self.model, self.mx, self.d, self.smooth, self.external = model, mx, d, smooth, external
+    def __init__(self, model, mx, d, smooth: Smooth):
+        self.model, self.mx, self.d, self.smooth = model, mx, d, smooth
 
     def number(self, name: str):
         return get_number(self.model, self.mx, name)
+
+    @functools.cached_property
+    def reactions(self) -> Reactions | None:
+        """The forces of the constraints, if a solver has found any."""
+        constraints = self.smooth.constraints
+        if constraints is None or not (constraints.sections or constraints.contacts):
+            return None
+        return Reactions(self.model, self.mx, self.d, self.smooth, constraints)
 
     @functools.cached_property
     def gravity(self):
@@ -108,8 +128,6 @@ class _Reader:
 
     @functools.cached_property
     def cameras(self):
-        from envs.physics.models import import_mjx
-
         return import_mjx().camlight(self.mx, self.d)
 
     def frame(self, kind: int, number: int):
@@ -175,12 +193,13 @@ class _Reader:
 
     @functools.cached_property
     def tendon_forces(self):
-        """Forces of springs, dampers and actuators of the tendons, less what accelerates their armature [ntendon]."""
+        """All forces along the tendons, less what accelerates their armature [ntendon]."""
         model, mx, d, smooth = self.model, self.mx, self.d, self.smooth
         force = find_tendon_forces(model, mx, d, smooth)
         for actuator in np.nonzero(model.actuator_trntype == TRANSMISSION.TENDON)[0]:
             here = np.arange(model.ntendon) == model.actuator_trnid[actuator, 0]
             force = force + here * d.actuator_force[actuator] * self.number("actuator_gear")[actuator, 0]
+        force = force + self.reactions.tendons if self.reactions else force
         armature = find_armature(model, mx, "tendon")
         if is_zero(armature):
             return force
@@ -188,20 +207,27 @@ class _Reader:
 
     @functools.cached_property
     def interactions(self):
-        """Force and torque about the world's origin that each body needs from what is not `external`."""
+        """Force and torque about the world's origin by which its joints act on each body and what that carries."""
         spin, (rate, acceleration) = self.velocities[0], self.accelerations
         arm = self.d.xipos - self.d.xpos
         acceleration = acceleration + cross_each(rate, arm) + cross_each(spin, cross_each(spin, arm))
         force = self.number("body_mass")[:, None] * acceleration
         torque = self._inertia_times(rate) + cross_each(spin, self._inertia_times(spin))
-        force, torque = force - self.d.xfrc_applied[:, :3], torque - self.d.xfrc_applied[:, 3:]
         torque = torque + cross_each(self.d.xipos, force)
+        return force - self.outer[0], torque - self.outer[1]
+
+    @functools.cached_property
+    def outer(self):
+        """Force and torque about the world's origin by all but gravity and joints on each body but the world."""
+        force = self.d.xfrc_applied[:, :3]
+        torque = self.d.xfrc_applied[:, 3:] + cross_each(self.d.xipos, force)
         if len(self.model.wrap_type):
             pull = find_tendon_pulls(self.model, self.d, self.tendon_forces)
-            force, torque = force - pull[0], torque - pull[1]
-        if self.external is not None:
-            force, torque = force - self.external[0], torque - self.external[1]
-        return force, torque
+            force, torque = force + pull[0], torque + pull[1]
+        if self.reactions:
+            force, torque = force + self.reactions.wrenches[0], torque + self.reactions.wrenches[1]
+        moves = np.arange(self.model.nbody)[:, None] > 0
+        return jnp.where(moves, force, 0.0), jnp.where(moves, torque, 0.0)
 
 
 # --- positions --------------------------------------------------------------------------------------------------------
@@ -216,9 +242,9 @@ def _read_projection(reader: _Reader, sensor: int):
     model, camera = reader.model, int(reader.model.sensor_refid[sensor])
     width, height = model.cam_resolution[camera]
     size = model.cam_sensorsize[camera]
-    focal = np.full(2, 0.5 / np.tan(model.cam_fovy[camera] * np.pi / 360.0) * height)
+    focal = np.full(2, 0.5 * height) / jnp.tan(reader.number("cam_fovy")[camera] * np.pi / 360.0)
     if size.all():
-        focal = model.cam_intrinsic[camera, :2].astype(float) / size * (width, height)
+        focal = reader.number("cam_intrinsic")[camera, :2].astype(float) / size * (width, height)
     _, target, _ = reader.frame(*reader.object_of(sensor))
     _, eye, axes = reader.frame(OBJECT.CAMERA, camera)
     x, y, depth = rotate_back(axes, target - eye)
@@ -248,6 +274,49 @@ def _read_ball_orientation(reader: _Reader, sensor: int):
     return normalize(reader.d.qpos[begin : begin + 4])
 
 
+def _read_range(reader: _Reader, sensor: int):
+    """The distance along the site's z-axis to the first geom that is visible and not of the same body, or -1."""
+    model, d, site = reader.model, reader.d, int(reader.model.sensor_objid[sensor])
+    origin, direction = d.site_xpos[site], d.site_xmat[site][:, 2]
+    distance = jnp.full((), MISS)
+    for geom in list_visible_geoms(model, int(model.site_bodyid[site])):
+        shape, size = SHAPES[model.geom_type[geom]], reader.number("geom_size")[geom]
+        other = find_distance(shape, d.geom_xpos[geom], d.geom_xmat[geom], size, origin, direction)
+        distance = jnp.minimum(distance, other)
+    return jnp.where(distance < MISS, distance, -1.0)
+
+
+def list_visible_geoms(model: mujoco.MjModel, body: int) -> list[int]:
+    """The geoms that a ray from a body can meet."""
+    has_material = model.geom_matid >= 0
+    alpha = model.geom_rgba[:, 3]
+    if model.nmat:
+        alpha = np.where(has_material, model.mat_rgba[np.maximum(model.geom_matid, 0), 3], alpha)
+    return np.flatnonzero((alpha != 0) & (model.geom_bodyid != body)).tolist()
+
+
+def _read_inside(reader: _Reader, sensor: int):
+    """1 if the object is inside of the site, else 0."""
+    model, (kind, number) = reader.model, reader.object_of(sensor)
+    site = int(model.sensor_refid[sensor])
+    _, point, _ = reader.frame(kind, number)
+    if kind == OBJECT.BODY and number > 0 and model.body_mass[number] < SMALL <= model.body_subtreemass[number]:
+        point = reader.d.subtree_com[number]
+    shape, size = SHAPES[model.site_type[site]], reader.number("site_size")[site]
+    return is_inside(shape, reader.d.site_xpos[site], reader.d.site_xmat[site], size, point).astype(float)
+
+
+def _read_limit(reader: _Reader, sensor: int):
+    """How far a limit is exceeded, its rate, or its force; 0 where it does not act."""
+    model, kind = reader.model, int(reader.model.sensor_type[sensor])
+    is_joint, number = kind in JOINT_LIMITS, _number_of(sensor, reader)
+    is_limited = (model.jnt_limited if is_joint else model.tendon_limited)[number]
+    if not is_limited or not reader.reactions or is_disabled(model, DISABLED.LIMIT):
+        return 0.0
+    limit = reader.reactions.find_joint_limit(number) if is_joint else reader.reactions.find_tendon_limit(number)
+    return limit[(JOINT_LIMITS if is_joint else TENDON_LIMITS).index(kind)]
+
+
 def _read_potential_energy(reader: _Reader, sensor: int):
     """-sum m g x, and the springs' energies."""
     d = reader.d
@@ -262,7 +331,7 @@ def _find_spring_energy(reader: _Reader):
         return 0.0
     rest, stiffness, energy = reader.number("qpos_spring"), reader.number("jnt_stiffness"), 0.0
     for joint, (kind, q) in enumerate(zip(model.jnt_type, model.jnt_qposadr, strict=True)):
-        higher = model.jnt_stiffnesspoly[joint]
+        higher = reader.number("jnt_stiffnesspoly")[joint]
         shifts = [(d.qpos[q] - rest[q])[None]]
         if kind in (FREE, BALL):
             turned = slice(q + 3 * (kind == FREE), q + 3 * (kind == FREE) + 4)
@@ -272,16 +341,16 @@ def _find_spring_energy(reader: _Reader):
     for tendon in range(model.ntendon):
         low, high = reader.number("tendon_lengthspring")[tendon]
         shift = jnp.maximum(d.ten_length[tendon] - high, 0.0) + jnp.minimum(d.ten_length[tendon] - low, 0.0)
-        coefficients = reader.number("tendon_stiffness")[tendon], model.tendon_stiffnesspoly[tendon]
-        energy = energy + _integrate_spring(*coefficients, shift[None])
+        coefficient, higher = (reader.number(f"tendon_{name}")[tendon] for name in ("stiffness", "stiffnesspoly"))
+        energy = energy + _integrate_spring(coefficient, higher, shift[None])
     return energy
 
 
-def _integrate_spring(stiffness, higher: np.ndarray, shift):
+def _integrate_spring(stiffness, higher, shift):
     """Energy of one spring, with |shift| where that has several components."""
     square = (shift * shift).sum()
     energy = 0.5 * stiffness * square
-    if higher.any():
+    if not is_zero(higher):
         x = shift[0] if shift.size == 1 else jnp.sqrt(jnp.where(square > 0, square, 1.0)) * (square > 0)
         energy = energy + sum(k * x ** (i + 3) / (i + 3) for i, k in enumerate(higher))
     return energy
@@ -358,6 +427,13 @@ def _read_force(reader: _Reader, sensor: int):
     return rotate_back(reader.d.site_xmat[site], wanted)
 
 
+def _read_outer_forces(reader: _Reader):
+    """cfrc_ext: torque about the centre of mass of the body's tree, and force [nbody, 6]."""
+    force, torque = reader.outer
+    center = reader.d.subtree_com[reader.model.body_rootid]
+    return jnp.concatenate([torque - cross_each(center, force), force], 1)
+
+
 def _read_tendon_force(reader: _Reader, sensor: int):
     model = reader.model
     here = (model.actuator_trntype == TRANSMISSION.TENDON) & (model.actuator_trnid[:, 0] == model.sensor_objid[sensor])
@@ -371,6 +447,12 @@ def _number_of(sensor: int, reader: _Reader) -> int:
 READERS = {
     getattr(SENSOR, name): read
     for name, read in {
+        "TOUCH": read_touch,
+        "CONTACT": read_contact,
+        "RANGEFINDER": _read_range,
+        "INSIDESITE": _read_inside,
+        **dict.fromkeys(("JOINTLIMITPOS", "JOINTLIMITVEL", "JOINTLIMITFRC"), _read_limit),
+        **dict.fromkeys(("TENDONLIMITPOS", "TENDONLIMITVEL", "TENDONLIMITFRC"), _read_limit),
         "MAGNETOMETER": _read_magnetometer,
         "CAMPROJECTION": _read_projection,
         "JOINTPOS": lambda r, s: r.d.qpos[r.model.jnt_qposadr[_number_of(s, r)]],

@@ -3,9 +3,23 @@
 from __future__ import annotations
 
 import dataclasses
-from typing import Any
+from typing import Any, NamedTuple
 
 from envs.physics.dynamics.tree import Tree
+
+
+class Constraints(NamedTuple):
+    """What a solver balances.
+
+    Attributes:
+      rows: all but contacts, as of `constraints.make_rows`.
+      sections: where the rows of each kind are.
+      contacts: for each dimension (contacts, their constraints), as of `contacts.make_contact_rows`.
+    """
+
+    rows: Any
+    sections: dict[str, slice]
+    contacts: list[tuple[Any, Any]]
 
 
 @dataclasses.dataclass
@@ -20,6 +34,7 @@ class Smooth:
       tendon_velocity: [ntendon].
       moment: derivatives of the actuators' lengths [nu, nv].
       actuator_velocity: [nu].
+      constraints: what the solver balanced; None without a solver.
       flag: 1.0 if the solver says that its solution is void, else 0.0.
     """
 
@@ -30,4 +45,5 @@ class Smooth:
     tendon_velocity: Any
     moment: Any
     actuator_velocity: Any
+    constraints: Constraints | None = None
     flag: Any = 0.0

@@ -10,6 +10,7 @@ them. Of a geom above a plane the extent decides alone.
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -20,19 +21,21 @@ import numpy as np
 
 from envs.physics.dynamics.rotations import rotate_each
 from envs.physics.pairs import SHAPES, Pair, find_margin
-from envs.physics.reach import enclose_geoms
+from envs.physics.reach import enclose_geoms, find_gap
 
 if TYPE_CHECKING:
     from mujoco import mjx
 
 # Axes along which a shape reaches less far than the capsule around it.
 FLAT_AXES = {"cylinder": (2,), "box": (0, 1, 2), "mesh": (0, 1, 2), "sdf": (0, 1, 2)}
+PARALLEL = 1e-6  # squared sine of an angle, below which segments count as parallel in single precision
 MANY_PAIRS = 64  # of geoms, above which those of a body are put together, so that there are fewer
 THICKER = 3.0  # how much thicker than the thickest of them the one capsule around several of a body may be
+LARGER = 3.0  # how much more volume than all of them the one box around several of a body may have
 
 
 class Solid(NamedTuple):
-    """A geom, or several spheres and capsules of a body as one capsule, with a capsule around it; in the body's frame.
+    """A geom, or the one capsule or box around several of a body, with a capsule around it; in the body's frame.
 
     Attributes:
       shape: its name.
@@ -68,15 +71,10 @@ def may_touch(model: mujoco.MjModel, d: mjx.Data, pairs: Sequence[Pair]) -> jax.
 
 
 def _list_solids(model, pairs: Sequence[Pair]) -> list[tuple[Solid, Solid, float]]:
-    """The pairs as solids with their margins; of very many pairs, a body's spheres and capsules become one."""
+    """The pairs as solids with their margins; of very many pairs, several solids of a body become one."""
     capsules = enclose_geoms(model)
     solids = {geom: _make_solid(model, geom, capsules) for pair in pairs for geom in (pair.geom1, pair.geom2)}
-    bundles, is_many = dict(solids), len(pairs) > MANY_PAIRS
-    for body in {solid.body for solid in solids.values()}:
-        round_ones = [g for g, solid in solids.items() if solid.body == body and solid.shape in ("sphere", "capsule")]
-        bundle = _bundle([solids[geom] for geom in round_ones]) if is_many and len(round_ones) > 1 else None
-        if bundle is not None:
-            bundles.update(dict.fromkeys(round_ones, bundle))
+    bundles = solids | _bundle_geoms(solids) if len(pairs) > MANY_PAIRS else solids
     margins: dict[tuple[int, int], float] = {}
     found: dict[tuple[int, int], tuple[Solid, Solid]] = {}
     for pair in pairs:
@@ -86,6 +84,18 @@ def _list_solids(model, pairs: Sequence[Pair]) -> list[tuple[Solid, Solid, float
         found[key] = one, other
         margins[key] = max(margins.get(key, -np.inf), find_margin(model, pair))
     return [(*solids, margins[key]) for key, solids in found.items()]
+
+
+def _bundle_geoms(solids: dict[int, Solid]) -> dict[int, Solid]:
+    """The one capsule around a body's spheres and capsules, and the one box around its boxes, by geom."""
+    found: dict[int, Solid] = {}
+    for body in {solid.body for solid in solids.values()}:
+        for shapes, enclose in ((("sphere", "capsule"), _enclose_in_capsule), (("box",), _enclose_in_box)):
+            members = [geom for geom, solid in solids.items() if solid.body == body and solid.shape in shapes]
+            bundle = enclose([solids[geom] for geom in members]) if len(members) > 1 else None
+            if bundle is not None:
+                found.update(dict.fromkeys(members, bundle))
+    return found
 
 
 def _make_solid(model, geom: int, capsules: tuple[np.ndarray, ...]) -> Solid:
@@ -99,7 +109,7 @@ def _make_solid(model, geom: int, capsules: tuple[np.ndarray, ...]) -> Solid:
     return Solid(shape, body, model.geom_pos[geom] + axes @ centre, axes, size, axes @ axis, float(radius))
 
 
-def _bundle(solids: list[Solid]) -> Solid | None:
+def _enclose_in_capsule(solids: list[Solid]) -> Solid | None:
     """One capsule around all, along the longest line between their ends; None if it is much thicker than they are."""
     ends = np.concatenate([[solid.middle - solid.half, solid.middle + solid.half] for solid in solids])
     radii = np.repeat([solid.radius for solid in solids], 2)
@@ -117,6 +127,21 @@ def _bundle(solids: list[Solid]) -> Solid | None:
     return Solid("capsule", solids[0].body, middle, axes, np.array([radius, length, 0.0]), length * line, radius)
 
 
+def _enclose_in_box(solids: list[Solid]) -> Solid | None:
+    """The smallest box around all in the axes of one of them; None if it has much more volume than they have."""
+    signs = np.array(list(itertools.product((-1.0, 1.0), repeat=3)))
+    corners = np.concatenate([solid.middle + signs * solid.size @ solid.axes.T for solid in solids])
+    spans = [(corners @ solid.axes).min(0) for solid in solids], [(corners @ solid.axes).max(0) for solid in solids]
+    low, high = map(np.array, spans)
+    best = int(np.prod(high - low, axis=1).argmin())
+    axes, middle, size = solids[best].axes, (low[best] + high[best]) / 2, (high[best] - low[best]) / 2
+    if np.prod(size) > LARGER * sum(np.prod(solid.size) for solid in solids):
+        return None
+    longest = int(size.argmax())
+    radius = float(np.linalg.norm(np.delete(size, longest)))
+    return Solid("box", solids[0].body, axes @ middle, axes, size, axes[:, longest] * size[longest], radius)
+
+
 def _are_near(d: mjx.Data, shapes: tuple[str, str], pairs: list[tuple[Solid, Solid, float]]) -> jax.Array:
     """Whether the two solids of each pair may be within its margin, all of the same shapes, `[n]` of bool."""
     ones, others, margins = zip(*pairs, strict=True)
@@ -125,14 +150,26 @@ def _are_near(d: mjx.Data, shapes: tuple[str, str], pairs: list[tuple[Solid, Sol
     if shapes[0] == "plane":
         normal = one.axes[:, :, 2]
         return jnp.sum(normal * offset, axis=1) - other.find_extent(normal) < margin
-    gap = _find_gap(-offset, one.half, other.half, one.length, other.length)
-    near = jnp.sum(gap**2, axis=1) < (one.radius + other.radius + margin) ** 2
+    gap = find_gap(-offset, one.half, other.half, one.length, other.length, PARALLEL)
+    near = jnp.sum(gap**2, axis=1) < (one.radius + other.radius + margin + _find_excess(one.length, other.length)) ** 2
     for solid in (one, other):
         for i in FLAT_AXES.get(solid.shape, ()):
             axis = solid.axes[:, :, i]
             reach = one.find_extent(axis) + other.find_extent(axis) + margin
             near = near & (jnp.abs(jnp.sum(axis * offset, axis=1)) < reach)
     return near
+
+
+def _find_excess(one: np.ndarray, other: np.ndarray) -> np.ndarray:
+    """A bound on how much `find_gap` exceeds the distance of two segments, for their half-lengths in m, `[n]`.
+
+    It is exact for parallel segments, from whatever point it starts. Turning the shorter segment about its middle until
+    it is parallel moves its points by at most shorter * sine. So the gap is too long by at most 2 shorter * sine. For
+    angles that count as parallel this is 2 shorter sqrt(PARALLEL). At larger ones the start is wrong by rounding alone,
+    and the gap too long by less than 6 eps longer / sine too (measured, eps = 6e-8). The less of both is at most
+    sqrt(12 eps shorter longer), below the result, which also bounds the gap for angles that count as parallel.
+    """
+    return 2 * np.sqrt(PARALLEL * one * other)
 
 
 class _Placed:
@@ -157,32 +194,3 @@ class _Placed:
             return jnp.abs(along) * self.size[:, 1] + across * self.size[:, 0]
         length = self.size[:, 1] if self.shape == "capsule" else np.zeros(len(self.size))
         return jnp.abs(along) * length + self.size[:, 0]
-
-
-def _find_gap(offset: jax.Array, u: jax.Array, v: jax.Array, one: np.ndarray, other: np.ndarray) -> jax.Array:
-    """The shortest vector from the segment t v to offset + s u, |s|, |t| <= 1, `[n, 3]`.
-
-    The best s for the whole lines, the best t for this s, and the best s for that t, each within its bounds, are the
-    solution (Ericson, "Real-Time Collision Detection", section 5.1.9).
-
-    Args:
-      offset, u, v: `[n, 3]`.
-      one, other: |u| and |v|, `[n]`.
-    """
-    gap = offset
-    if not other.any():
-        return offset + _divide(-jnp.sum(u * offset, axis=1), one)[:, None] * u if one.any() else offset
-    along_other = jnp.sum(v * offset, axis=1)
-    if one.any():
-        along_one, mixed = jnp.sum(u * offset, axis=1), jnp.sum(u * v, axis=1)
-        across = jnp.maximum((one * other) ** 2 - mixed**2, 1e-6 * (one * other) ** 2 + mujoco.mjMINVAL)
-        s = jnp.clip((mixed * along_other - along_one * other**2) / across, -1, 1)
-        s = _divide(mixed * _divide(mixed * s + along_other, other) - along_one, one)
-        gap = offset + s[:, None] * u
-        along_other = along_other + s * mixed
-    return gap - _divide(along_other, other)[:, None] * v
-
-
-def _divide(x: jax.Array, length: np.ndarray) -> jax.Array:
-    """x / length^2 between -1 and 1; 0 for a segment without length."""
-    return jnp.clip(x * np.where(length > 0, 1 / np.maximum(length, 1e-6) ** 2, 0.0), -1, 1)
