@@ -112,6 +112,7 @@ class MjxEnv:
         MuJoCo's step itself, which is never checked).
       check: log differences from C MuJoCo's motion (`envs.physics.check_model`), which takes a second or more. The
         shipped environments leave this to the tests.
+      inputs, outputs: what `physics_step` is a function of, and what it returns (`envs.physics.compile_step`).
     """
 
     if TYPE_CHECKING:  # a subclass has them
@@ -119,12 +120,21 @@ class MjxEnv:
         def reset(self, rng: jax.Array, /) -> AnyState: ...
         def step(self, state: Any, action: jax.Array, /) -> AnyState: ...
 
-    def __init__(self, spec: Any, num_substeps: int = 1, physics: str = "scalar", check: bool = True):
+    def __init__(
+        self,
+        spec: Any,
+        num_substeps: int = 1,
+        physics: str = "scalar",
+        check: bool = True,
+        *,
+        inputs: tuple[str, ...] = ("qpos", "qvel", "ctrl"),
+        outputs: tuple[str, ...] = ("qpos", "qvel"),
+    ):
         self.model = compile_model(spec)
         if check and physics != "mujoco":
             check_once(self.model)
         self.dt = self.model.opt.timestep * num_substeps
-        self.physics_step = compile_step(self.model, num_substeps, physics=physics)
+        self.physics_step = compile_step(self.model, num_substeps, inputs=inputs, outputs=outputs, physics=physics)
 
     @property
     def observation_size(self) -> int:

@@ -1,6 +1,6 @@
 """MuJoCo Playground's environments, by name: `make("playground", name="CartpoleBalance")`.
 
-As in Playground, they are stepped by `mjx.step` in JAX, and are as fast as that is on a CPU. If Playground has several
+Playground steps them by `mjx.step`; here `envs.playground_physics` stands in for it. If Playground has several
 observations by name, such as one for the critic only, the entry "state" is used.
 """
 
@@ -11,7 +11,7 @@ import importlib.util
 import io
 import subprocess
 import warnings
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -20,6 +20,7 @@ import jax
 from envs.base import State
 from envs.hints import pip_install
 from envs.options import OptionError, describe_unknown, option
+from envs.physics import PHYSICS
 from envs.scenes import Scene
 
 # Steps are slow, so checkpoints come after fewer of them.
@@ -45,6 +46,7 @@ class PlaygroundConfig:
     """Options of a Playground environment."""
 
     name: str = option("CartpoleBalance", "Playground's name of the environment")
+    physics: str = option("scalar", "MuJoCo's step as scalar equations, MJX, or C MuJoCo", choices=tuple(PHYSICS))
     episode_length: int = option(1000, "steps until the time limit", at_least=1)
 
 
@@ -53,10 +55,12 @@ class Playground:
 
     Args:
       env: has Playground's `reset(key) -> State` and `step(State, action) -> State`.
+      physics: "mjx", which is Playground's own; or "scalar" or "mujoco".
     """
 
-    def __init__(self, env: Any):
+    def __init__(self, env: Any, physics: str = "mjx"):
         self.env, self.action_size = env, env.action_size
+        self._in_place = contextlib.nullcontext if physics == "mjx" else _make_physics(env, physics)
 
     @property
     def observation_size(self) -> int:
@@ -80,11 +84,19 @@ class Playground:
 
     def reset(self, rng: jax.Array) -> State:
         """Playground's reset; it gets the key as two numbers, since it stores keys in its states."""
-        return adapt_state(self.env.reset(jax.random.key_data(rng)))
+        with self._in_place():
+            return adapt_state(self.env.reset(jax.random.key_data(rng)))
 
     def step(self, state: State, action: jax.Array) -> State:
         """Playground's step."""
-        return adapt_state(self.env.step(state.pipeline_state, action))
+        with self._in_place():
+            return adapt_state(self.env.step(state.pipeline_state, action))
+
+
+def _make_physics(env: Any, physics: str) -> Callable[[], contextlib.AbstractContextManager]:
+    from envs.playground_physics import Physics  # loads mujoco
+
+    return Physics(env, physics).in_place
 
 
 def adapt_state(state: Any) -> State:
@@ -111,9 +123,11 @@ def make(config: PlaygroundConfig) -> Playground:
         if config.name not in registry.ALL_ENVS:
             raise OptionError([describe_unknown("Playground environment", config.name, registry.ALL_ENVS)])
         try:
-            return Playground(registry.load(config.name, config_overrides={"impl": "jax"}))
+            env = registry.load(config.name, config_overrides={"impl": "jax"})
         except (OSError, subprocess.SubprocessError) as error:
             reason = f"its robot is from MuJoCo Menagerie, which Playground could not download ({error})"
         except AttributeError as error:
             reason = f"Playground does not work with this release of MuJoCo ({error})"
+        else:
+            return Playground(env, config.physics)
     raise OptionError([f"env.name={config.name}: {reason}"])

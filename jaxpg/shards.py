@@ -11,7 +11,7 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 import jax
-from jax.sharding import AxisType, Mesh, PartitionSpec
+from jax.sharding import AxisType, PartitionSpec
 
 from jaxpg.types import Algorithm, PyTree, TrainState
 
@@ -32,7 +32,7 @@ def shard(algorithm: Algorithm, num_shards: int, devices: Sequence[Device]) -> A
         numbers are the same up to rounding.
     """
     if len(devices) >= num_shards:
-        mesh = _make_mesh(devices[:num_shards])
+        mesh = jax.make_mesh((num_shards,), (AXIS,), axis_types=(AxisType.Auto,), devices=devices[:num_shards])
         state = _make_state_spec(PartitionSpec(), PartitionSpec(AXIS))
         init = jax.shard_map(algorithm.init, mesh=mesh, in_specs=PartitionSpec(), out_specs=state, check_vma=False)
         step = jax.shard_map(
@@ -48,25 +48,6 @@ def shard(algorithm: Algorithm, num_shards: int, devices: Sequence[Device]) -> A
     init = jax.vmap(algorithm.init, in_axes=None, out_axes=state, **axis)
     step = jax.vmap(algorithm.step, in_axes=(state, None), out_axes=(state, None), **axis)
     return Algorithm(_join_init(init), _join_step(step, num_shards))
-
-
-def map_in_parts(fn: Callable[[PyTree, PyTree], PyTree], number: int, devices: Sequence[Device]) -> Callable:
-    """Runs `fn(shared, divided)`, which maps over the leading axis of `divided`, on several devices at once.
-
-    Args:
-      fn: its result has the same leading axis, and each row depends only on the same row of `divided`.
-      number: number of parts; must divide the number of rows.
-      devices: the parts run on the first of these; if there are fewer, all run together on one.
-    """
-    if number == 1 or len(devices) < number:
-        return fn
-    mesh = _make_mesh(devices[:number])
-    rows = PartitionSpec(AXIS)
-    return jax.shard_map(fn, mesh=mesh, in_specs=(PartitionSpec(), rows), out_specs=rows, check_vma=False)
-
-
-def _make_mesh(devices: Sequence[Device]) -> Mesh:
-    return jax.make_mesh((len(devices),), (AXIS,), axis_types=(AxisType.Auto,), devices=devices)
 
 
 def _make_state_spec(shared: PyTree, divided: PyTree) -> TrainState:

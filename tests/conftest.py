@@ -43,7 +43,8 @@ def pytest_collection_modifyitems(items):
 
 
 def pytest_runtest_setup(item):
-    """On a machine that is many times slower than usual a part of the slow tests has to do."""
+    """Compiles quickly; and on a machine that is many times slower than usual a part of the slow tests has to do."""
+    jax.config.update("jax_disable_most_optimizations", item.get_closest_marker("optimized") is None)
     if is_slow(item) and time.monotonic() - BEGAN > 60 * item.config.getoption("minutes"):
         pytest.skip("slow, and the time given with --minutes is over")
 

@@ -1,5 +1,6 @@
 """C MuJoCo's step from compiled programs: its very bits, whoever calls at the same time; divergence is to be seen."""
 
+import copy
 import functools
 import json
 import subprocess
@@ -18,7 +19,7 @@ from processes import outcome
 import envs
 from envs.physics import PHYSICS, MujocoModelError, compile_step
 from envs.physics.callback import Simulations
-from envs.physics.fields import INPUTS, OUTPUTS, find_types
+from envs.physics.fields import INPUTS, JACOBIANS, OUTPUTS, find_types
 from jaxpg.actor_critic import actor_critic
 from jaxpg.estimators import gae
 from jaxpg.methods import td
@@ -55,16 +56,35 @@ def rich_inputs(model, number, seed=0):
     return values
 
 
+def read_field(model, data, name):
+    """A field as a caller of C MuJoCo gets it."""
+    if name in JACOBIANS:
+        kind, which = name.split("_jac")
+        compute = {"site": mujoco.mj_jacSite, "body": mujoco.mj_jacBody}[kind]
+        jacobians = np.zeros((getattr(model, f"n{kind}"), 2, 3, model.nv))
+        for number, (jacp, jacr) in enumerate(jacobians):
+            compute(model, data, jacp, jacr, number)
+        return jacobians[:, "pr".index(which)]
+    return np.array(getattr(data, name), float)
+
+
 def by_loop(model, values, num_substeps, outputs):
-    """The same by `mj_step`, each environment in data of its own."""
+    """The same by `mj_step`, each environment in data of its own; cfrc_ext of the velocities of the other fields."""
+    model = copy.copy(model)
+    model.opt.enableflags |= mujoco.mjtEnableBit.mjENBL_ENERGY
     results = []
     for place in range(len(values["qpos"])):
         data = mujoco.MjData(model)
         for name, x in values.items():
             setattr(data, name, x[place])
         for _ in range(num_substeps):
+            before = data.qvel.copy()
             mujoco.mj_step(model, data)
-        results.append([np.array(getattr(data, name), float) for name in outputs])
+        other = copy.copy(data)
+        other.qvel[:] = before
+        mujoco.mj_rnePostConstraint(model, other)
+        data.cfrc_ext[:] = other.cfrc_ext
+        results.append([read_field(model, data, name) for name in outputs])
     return [np.stack(x).reshape(len(x), -1) for x in zip(*results, strict=True)]
 
 
@@ -330,6 +350,25 @@ def test_models_differ_as_they_do_by_mjx():
         np.testing.assert_allclose(mine, other, rtol=1e-9, atol=1e-9, err_msg=name)
 
 
+def test_geoms_that_are_moved_or_enlarged_touch():
+    """MuJoCo looks for contacts by boxes and spheres around geoms, which stay as they were."""
+    ground = "".join(f'<geom type="box" size="1 1 .1" pos="0 0 {-0.1 - 3 * x}"/>' for x in range(4))
+    balls = "".join(f'<geom size=".1" pos="{x} 0 0"/>' for x in range(4))
+    body = f'<body pos="-1 0 .5"><freejoint/>{balls}</body>'
+    model = mujoco.MjModel.from_xml_string(f"<mujoco><worldbody>{ground}{body}</worldbody></mujoco>")
+    lower = np.array(model.geom_pos)
+    lower[5, 2] -= 0.5
+    larger = np.array(model.geom_size)
+    larger[7] *= 12
+    for field, other in {"geom_pos": lower, "geom_size": larger}.items():
+        step = compile_step(model, inputs=("qpos", "qvel", "model." + field), outputs=("qvel",), physics="mujoco")
+        (velocity,) = jax.vmap(step, (None, None, 0))(
+            model.qpos0, np.zeros(6), np.stack([getattr(model, field), other])
+        )
+        assert velocity[0, 2] == pytest.approx(-9.81 * model.opt.timestep, rel=1e-4)
+        assert abs(velocity[1] - velocity[0]).max() > 0.1
+
+
 def test_inertial_frames_that_cannot_differ_are_refused():
     """A body alone in space has a diagonal matrix of inertia, of which MuJoCo stores no more unless it is told to."""
     alone = models.chain('<body name="ball"><freejoint/><geom size="0.1"/></body>')
@@ -342,6 +381,14 @@ def test_inertial_frames_that_cannot_differ_are_refused():
     moved = compile_step(model, inputs=inputs, outputs=("xipos",), physics="mujoco")
     (centre,) = moved(model.qpos0, np.zeros(6), np.array([[0, 0, 0], [0.1, 0, 0]]))
     np.testing.assert_allclose(centre[1], [0.1, 0, 0], atol=1e-6)
+
+
+def test_masses_that_would_be_ignored_are_refused():
+    """MuJoCo takes the matrix of inertia of a body alone in space from `dof_M0`."""
+    model = mujoco.MjModel.from_xml_string(models.chain('<body name="ball"><freejoint/><geom size="0.1"/></body>'))
+    for field in ("model.body_mass", "model.dof_armature"):
+        with pytest.raises(ValueError, match=rf"^{field}: C MuJoCo needs model.dof_M0 beside it, as body 'ball'"):
+            compile_step(model, inputs=("qpos", "qvel", field), physics="mujoco")
 
 
 def test_a_model_that_cannot_be_batched_is_named():

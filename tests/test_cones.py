@@ -1,14 +1,15 @@
 """The functions of friction cones: convex, smooth, with forces inside the cone, and the derivatives of each other."""
 
 import jax
-import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from envs.physics import numeric
 from envs.physics.dynamics.cones import Ellipse, Pyramid
+from envs.physics.interpreter import trace
 
 NUMBER = 200  # vectors u of a cone, at once
 SIZES = {Pyramid: (1, 3, 4, 6), Ellipse: (3, 4, 6)}
@@ -163,21 +164,30 @@ def test_what_is_not_active_does_nothing(kind, size):
 def test_nothing_is_nan_at_rest(kind, size):
     """Neither values nor their derivatives, where components of u are 0."""
     cone, _ = draw(kind, size, 0)
-    u = np.array([x * np.eye(size)[i] for x in (0.0, 1.0, -1.0) for i in range(size)])
-    for results in (evaluate(cone, u, u), jax.jacobian(lambda u: evaluate(cone, u, u))(u)):
-        assert all(np.isfinite(part).all() for part in results)
-    stiffness = jax.jacobian(lambda cone: evaluate(cone, u, u))(cone)
-    assert all(np.isfinite(part).all() for part in jax.tree.leaves(stiffness))
+    us = np.array([x * np.eye(size)[i] for x in (0.0, 1.0, -1.0) for i in range(size)])
+
+    def single(cone, u):
+        return cone.slope(u), cone.curvature(u), *cone.slope_along(u, u)
+
+    program = trace(lambda *given: (single(*given), jax.jacobian(single, argnums=(0, 1))(*given)), cone, us[0])
+    numbers = [np.broadcast_to(x, (len(us), *np.shape(x))) for x in cone]
+    assert all(np.isfinite(part).all() for part in numeric.evaluate(program, [*numbers, us]))
 
 
 @pytest.mark.parametrize("size", SIZES[Ellipse])
 def test_without_sliding_the_cones_are_one_spring(size):
     """-D min(u_0, 0), D of the normal force alone; at 2 (k - 1) edges for the pyramid."""
+
+    @jax.jit
+    def pull(u):
+        ellipse = Ellipse.make(np.array(0.5), np.ones(size - 1), True, 1.0)
+        pyramid = Pyramid.make(0.5, np.ones(size - 1), True, 1.0)
+        return -ellipse.slope(u), -pyramid.slope(u)[0], pyramid.stiffness
+
     for u in (0.7, -0.7):
-        force = -np.asarray(Ellipse.make(np.array(0.5), np.ones(size - 1), True, 1.0).slope(u * jnp.eye(size)[0]))
+        force, normal_force, stiffness = pull(u * np.eye(size)[0])
         np.testing.assert_allclose(force, np.eye(size)[0] * max(-u, 0) / 0.5)
-        cone = Pyramid.make(0.5, np.ones(size - 1), True, 1.0)
-        np.testing.assert_allclose(-cone.slope(u * jnp.eye(size)[0])[0], 2 * (size - 1) * cone.stiffness * max(-u, 0))
+        np.testing.assert_allclose(normal_force, 2 * (size - 1) * stiffness * max(-u, 0))
 
 
 @pytest.mark.parametrize("cone", ["pyramidal", "elliptic"])

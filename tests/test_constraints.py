@@ -5,8 +5,8 @@ import copy
 import jax
 import mujoco
 import numpy as np
+import published
 import pytest
-import robots
 from constrained import converge, find_accelerations, make_stepper
 from dynamics import draw_state
 
@@ -176,18 +176,19 @@ CONTACTS = {
     "no weights": ('solmix="0" solref=".04 1"', 'solmix="0" solref=".02 .5"'),
     "one weight": ('solmix="0" solref=".04 1"', 'solmix="3" solref=".02 .5"'),
     "no friction": ('friction="0 0 0"', 'friction="0 0 0"'),
+    "gap": ('margin=".02" gap=".05"', 'margin=".01" gap=".02"'),
 }
 
 
-def touch(cone, own="", ground="", more="", impratio=1, place=GROUND, moving=ROUND):
+def touch(cone, own="", ground="", more="", impratio=1, place=GROUND, moving=ROUND, **options):
     own = own if isinstance(own, tuple) else (own,) * 4
     bodies = place.format(ground) + moving.format(*own)
-    return write(bodies, more, option=f'cone="{cone}" impratio="{impratio}"')
+    return write(bodies, more, option=f'cone="{cone}" impratio="{impratio}" {options.pop("option", "")}', **options)
 
 
 def list_pairs(solreffriction):
     """The ball and the box touch the ground and each other by <pair>s."""
-    numbers = 'friction=".7 .3 .02 .01 .03" solref=".03 1" margin=".03" solimp=".3 .9 .05 .5 2"'
+    numbers = 'friction=".7 .3 .02 .01 .03" solref=".03 1" margin=".03" solimp=".3 .9 .05 .5 2" gap=".1"'
     pairs = [f'<pair geom1="ground" geom2="{name}" condim="{condim}" solreffriction="{solref}" {numbers}/>'
              for name, condim, solref in zip(("ball", "box"), (6, 3), solreffriction, strict=True)]  # fmt: skip
     return f'<contact>{"".join(pairs)}<pair geom1="ball" geom2="box" condim="4" friction="1 .5 .2 .1 .05"/></contact>'
@@ -202,6 +203,15 @@ for cone, kind in CONE.items():
     for name, damping in {"pairs": (".2 1", "0 -30"), "zero and mixed solreffriction": ("0 0", ".2 -1")}.items():
         pairs = touch(cone, more=list_pairs(damping), moving=BOX + BALL)
         MODELS[f"{cone} contacts, {name}"] = pairs, kind
+    overridden = touch(
+        cone, *CONTACTS["priority"], list_pairs(damping), moving=BOX + BALL, flag='override="enable"',
+        option='o_margin=".01" o_solref=".03 .8" o_solimp=".6 .9 .02 .4 3" o_friction=".7 .3 .02 .01 .03"',
+    )  # fmt: skip
+    MODELS[f"{cone} contacts, overridden parameters"] = overridden, kind
+
+# The fixed body has the higher number, and is first in one contact and second in the other.
+LAST = '<body>{}<geom type="box" size=".1 .1 .1" pos=".1 0 0"/></body>'.format(GROUND.format(""))
+MODELS["contacts with the last body"] = touch("pyramidal", place=BALL.format("", ""), moving=LAST), CONE["pyramidal"]
 
 FLAGS = (
     "constraint",
@@ -298,14 +308,14 @@ def bend(model, rng):
 
 def load_colliding(name):
     """The robot without what it would do with its meshes, and the pairs of geoms whose contacts are equations."""
-    model = change_collision(robots.load(name), "primitives")
+    model = change_collision(published.load(name), "primitives")
     features = unsupported_features(model)
     if features:
         pytest.skip(f"stepped by C MuJoCo: {features}")
     return model
 
 
-@robots.each_robot
+@published.each_robot
 def test_robots(name):
     """Their accelerations in states with limits active; contacts as far as they are equations, of the planes."""
     model = load_colliding(name)

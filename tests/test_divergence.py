@@ -183,10 +183,15 @@ def started(made):
 @pytest.mark.parametrize("name", ALGORITHMS)
 def test_nothing_is_learned_from_an_explosion(name, networks):
     """Its size changes no bit of what is learned: parameters, optimizer, statistics, returns, losses."""
+
+    @jax.jit
+    def learn(size):
+        made = algorithm(name, Path(size), networks)
+        return made.step(started(made), jax.random.key(1))
+
     results = []
     for size in (2e2, 9e5):
-        made = algorithm(name, Path(size), networks)
-        state, metrics = jax.jit(made.step)(started(made), jax.random.key(1))
+        state, metrics = learn(size)
         assert metrics["diverged"] > 0
         assert all(np.isfinite(x).all() for x in jax.tree.leaves((state.params, state.normalizer, metrics)))
         results.append((state.params, state.opt_state, state.normalizer, metrics))
@@ -197,7 +202,7 @@ def test_nothing_is_learned_from_an_explosion(name, networks):
 def test_where_all_episodes_diverge_nothing_is_learned_at_all(name):
     """Parameters and optimizer stay to the bit, its momentum notwithstanding; statistics know no sample of it."""
     made = algorithm(name, Path(2e2, share=1.0))
-    before = started(made)
+    before = jax.jit(lambda: started(made))()
     after, metrics = jax.jit(made.step)(before, jax.random.key(1))
     jax.tree.map(np.testing.assert_array_equal, after.params, before.params)
     if name != "online":  # whose traces end with the episodes
@@ -253,12 +258,15 @@ def test_returns_are_of_sound_episodes():
 def test_learning_goes_on_beside_explosions(name):
     """With a tenth of the joints unstable the others end as near the best angle as without: their mean command."""
     updates = {"td": 150, "ppo": 60, "reinforce": 100, "online": 400}[name]
-    commands = []
-    for share in (0.0, 0.1):
+
+    @jax.jit
+    def command(share):
         made = algorithm(name, Servo(ExplodingConfig(share=share)), num_envs=32, episode_length=30)
-        state, _ = jax.jit(lambda made=made: train_scan(made, jax.random.key(0), updates))()
+        state, _ = train_scan(made, jax.random.key(0), updates)
         mean, _ = NETWORKS["mlp"].policy(state.params["actor"], jnp.linspace(-1, 1, 5)[:, None])
-        commands.append(float(jnp.tanh(mean).mean()))
+        return jnp.tanh(mean).mean()
+
+    commands = [float(command(share)) for share in (0.0, 0.1)]
     assert commands[0] > 0.2, "it learns"
     assert commands[1] > 0.2
     assert commands[1] == pytest.approx(commands[0], abs=0.25)

@@ -1,6 +1,7 @@
 """The experiments run from beginning to end, here with tiny sizes; their figures come from the full ones."""
 
 import ast
+import copy
 import json
 import runpy
 import subprocess
@@ -171,6 +172,31 @@ def test_robots(experiments, monkeypatch):
         assert abs(rows["near"]["speeds"][kind]["left_to_c"] - touching) < 0.01
     low, middle, high = rows["far"]["speeds"]["all"]["ours_over_C"]
     assert 0 < low <= middle <= high
+
+
+def test_long_run(experiments, monkeypatch):
+    """Ours is C MuJoCo's, and what a wrong model does is seen: here one with another damping."""
+    import long_run
+
+    (experiments / "claw.xml").write_text(CLAW.format(1))
+    monkeypatch.setattr(long_run, "SYSTEMS", {"pendulum": long_run.SYSTEMS["double pendulum, Euler"]})
+    long_run.main([str(experiments / "claw.xml"), "--envs", "3", "--steps", "20", "--long_steps", "200"])
+    found = json.loads((experiments / "long_run.json").read_text())
+    assert found["models"][0]["ours"]["velocity"][1] < 1e-12
+    methods = found["systems"][0]["methods"]
+    np.testing.assert_allclose(methods["float64"]["energy"], methods["C"]["energy"], rtol=1e-9)
+    np.testing.assert_allclose(methods["float32"]["energy"], methods["C"]["energy"], rtol=1e-3)
+    play_in_c = long_run.play_in_c
+
+    def damp(model, *given):
+        model = copy.copy(model)
+        model.dof_damping[:] = 0.01
+        return play_in_c(model, *given)
+
+    monkeypatch.setattr(long_run, "play_in_c", damp)
+    long_run.main([str(experiments / "claw.xml"), "--envs", "3", "--steps", "20", "--long_steps", "100"])
+    found = json.loads((experiments / "long_run.json").read_text())
+    assert found["models"][0]["ours"]["velocity"][1] > 1e-6
 
 
 @pytest.mark.study
@@ -393,3 +419,45 @@ def test_the_evaluation_is_gymnasiums(monkeypatch):
     assert truncated.all()
     np.testing.assert_allclose(protocol.play(act), returns, rtol=1e-6)
     assert returns.mean() > -400
+
+
+@pytest.mark.study
+def test_panda_reach(experiments, monkeypatch):
+    import panda_reach
+
+    sizes = ("num_envs=4", "num_steps=2", "algo.num_shards=1", "algo.minibatches=1", "eval_episodes=2")
+    training = panda_reach.Training
+    monkeypatch.setattr(panda_reach, "prepare", lambda config: None)  # it is too late in this process
+    monkeypatch.setattr(panda_reach, "Training", lambda physics: training(physics, sizes))
+    panda_reach.main(["--physics", "mujoco", "--rounds", "2"])
+    (row,) = json.loads((experiments / "panda_reach.json").read_text())
+    assert row["physics"] == "mujoco"
+    assert 0 < row["rate"][0] <= row["rate"][1] <= row["rate"][2]
+
+
+def test_the_pandas_flange_is_observed_where_c_mujoco_has_it(experiments):
+    import panda_reach
+
+    env = panda_reach.Reach(panda_reach.ReachConfig(physics="mujoco"))
+    state = jax.jit(env.reset)(jax.random.key(0))
+    data = mujoco.MjData(env.model)
+    data.qpos = state.pipeline_state.qpos
+    mujoco.mj_kinematics(env.model, data)
+    error = np.asarray(state.pipeline_state.goal) - data.site("flange").xpos
+    np.testing.assert_allclose(state.obs[-3:], error, atol=1e-6)
+    after = jax.jit(env.step)(state, np.zeros(7, np.float32))
+    squared = np.sum(error**2)
+    np.testing.assert_allclose(after.reward, -squared - squared**0.5, rtol=1e-5)
+
+
+@pytest.mark.study
+def test_mujoco_environments(experiments, capsys):
+    import mujoco_environments
+
+    sizes = ("--envs", "4", "--steps", "5", "--rounds", "1")
+    mujoco_environments.main(["brax:inverted_pendulum", "brax:swimmer", *sizes])
+    found, refused = json.loads((experiments / "mujoco_environments.json").read_text())
+    assert found["scalar"]["reward"] == found["mujoco"]["reward"] == found["mjx"]["reward"] == 1
+    assert found["ratio"][1] == pytest.approx(found["scalar"]["rate"][1] / found["mjx"]["rate"][1])
+    assert "swimmer" in refused["error"]
+    assert len(capsys.readouterr().out.splitlines()) == 3

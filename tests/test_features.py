@@ -6,8 +6,8 @@ import jax
 import models
 import mujoco
 import numpy as np
+import published
 import pytest
-import robots
 
 from envs.physics import MujocoModelError, check_model, compile_step, describe, step
 from envs.physics.collision import change_collision, describe_meshes, list_colliding_meshes, measure_fit
@@ -15,27 +15,18 @@ from envs.physics.features import unsupported_features
 from envs.physics.models import import_mjx, put_model
 from envs.physics.numeric import evaluate
 
+DELAYED = '<motor joint="pole" delay="0.01" nsample="4"/>'
 MOTOR = '<motor joint="pole" {}/>'
 TOUCHING = '<mujoco>{}<worldbody><geom {} size="0.1"/><body><freejoint/><geom size="0.1"/></body></worldbody></mujoco>'
 FLOAT = '<mujoco><option {}/><worldbody><body><freejoint/><geom size="0.1" {}/></body></worldbody></mujoco>'
 ODD = [
-    (models.chain(models.pole(joint='stiffness="1 1"'), ""), "higher stiffness coefficients of joints"),
-    (models.chain(models.pole(joint='damping="1 1"'), ""), "higher damping coefficients of joints"),
-    (models.chain(models.pole(), MOTOR.format('damping="3"')), "damping of actuators"),
-    (models.chain(models.pole(), MOTOR.format('armature="3"')), "armature of actuators"),
     (models.chain(models.pole(), MOTOR.format('delay="0.01" nsample="4"')), "delay of actuators"),
     (models.chain(models.pole(), '<adhesion body="world" ctrlrange="0 1"/>'), "transmission type body"),
-    (
-        models.chain(models.pole(), MOTOR.format('group="1"'), '<option actuatorgroupdisable="1"/>'),
-        "disabled groups of actuators",
-    ),
     (models.chain(models.pole(), option='<option integrator="discrete"/>'), 'the integrator "discrete"'),
     (models.chain(models.pole(), option='<option><flag sleep="enable"/></option>'), "sleeping islands"),
     (TOUCHING.format("", 'surfacevel="1 0 0 0 0 0"'), "surface velocity of geoms"),
     (TOUCHING.format("", 'adhesion="1"'), "adhesion of geoms"),
-    (TOUCHING.format("", 'gap="0.1"'), "gap of geoms"),
     (TOUCHING.format('<option noslip_iterations="3"/>', ""), "noslip iterations of the solver"),
-    (TOUCHING.format('<option><flag override="enable"/></option>', ""), "the flag override"),
     (TOUCHING.format('<option><flag diagexact="enable"/></option>', ""), "the flag diagexact"),
     (FLOAT.format('density="1"', 'fluidshape="ellipsoid"'), "fluid forces on ellipsoids"),
 ]
@@ -48,19 +39,40 @@ def test_what_is_not_simulated_is_named(xml, words):
     assert words in feature
 
 
-@pytest.mark.parametrize("kind", ["touch", "force", "torque"])
-def test_sensors_of_contacts_count_where_they_are_wanted(kind):
-    model = mujoco.MjModel.from_xml_string(FELT.replace("</mujoco>", f'<sensor><{kind} site="s"/></sensor></mujoco>'))
-    assert unsupported_features(model) == []
-    assert unsupported_features(model, ("qpos", "sensordata")) == [f"sensors of type {kind}"]
+@pytest.mark.parametrize(
+    ("sensor", "kind"),
+    [
+        ('contact name="x" site="s" num="2" data="found force"', "contact"),
+        ('rangefinder name="x" site="s" data="dist normal"', "rangefinder"),
+        ('distance name="x" geom1="g" body2="world"', "geomdist"),
+    ],
+)
+def test_sensors_count_where_they_are_wanted(sensor, kind):
+    felt = FELT.replace('<geom size="0.1"/><site', '<geom name="g" size="0.1"/><site')
+    sensors = f'<sensor><touch name="y" site="s"/><{sensor}/><force site="s"/></sensor></mujoco>'
+    model = mujoco.MjModel.from_xml_string(felt.replace("</mujoco>", sensors))
+    assert unsupported_features(model) == unsupported_features(model, ("sensordata[y]",)) == []
+    for output in ("sensordata", "sensordata[x]"):
+        assert unsupported_features(model, ("qpos", output)) == [f"sensors of type {kind}"]
     alone = models.chain(models.pole(), more='<sensor><jointpos joint="pole"/></sensor>')
     assert unsupported_features(mujoco.MjModel.from_xml_string(alone), ("qpos", "sensordata")) == []
+
+
+def test_forces_on_bodies_lack_the_pull_of_tendons_around_geoms():
+    tendon = """<tendon><spatial stiffness="9"><site site="s"/><geom geom="g"/><site site="t"/></spatial></tendon>"""
+    around = FELT.replace('<geom size="0.1"/><site', '<geom name="g" size="0.1"/><site').replace("</mujoco>", tendon)
+    around = around.replace("<worldbody>", '<worldbody><site name="t" pos="0 0 1"/>')
+    model = mujoco.MjModel.from_xml_string(around + "</mujoco>")
+    assert unsupported_features(model, ("qpos",)) == []
+    for output in ("cfrc_ext", "cfrc_ext[world]"):
+        assert unsupported_features(model, (output,)) == ["cfrc_ext with tendons around geoms"]
 
 
 @pytest.mark.parametrize(
     "xml",
     [
-        models.chain(models.pole(), MOTOR.format('group="1"'), '<option actuatorgroupdisable="2"/>'),
+        models.chain(models.pole(), MOTOR.format('group="1"'), '<option actuatorgroupdisable="1"/>'),
+        TOUCHING.format('<option><flag override="enable"/></option>', 'gap="0.1"'),
         TOUCHING.format('<option noslip_iterations="3"><flag constraint="disable"/></option>', ""),
         FLOAT.format("", 'fluidshape="ellipsoid"'),
         FLOAT.format('density="1"', ""),
@@ -83,22 +95,22 @@ def test_ordinary_models_have_no_such_feature(name):
     assert unsupported_features(models.make(name)) == []
 
 
-@robots.each_robot
+@published.each_robot
 def test_published_robots_have_no_such_feature(name):
-    assert unsupported_features(robots.load(name), ("sensordata",)) == []
+    assert unsupported_features(published.load(name), ("sensordata",)) == []
 
 
 def test_a_model_with_such_a_feature_moves_as_in_mujoco(caplog, monkeypatch):
-    """Whereas MJX would leave the damping of the actuator out."""
+    """Whereas MJX would leave the delay of the actuator out."""
     monkeypatch.setattr(step, "_warned", set())
-    model = mujoco.MjModel.from_xml_string(models.chain(models.pole(), MOTOR.format('damping="3"')))
-    state = np.full(1, 0.3), np.ones(1), np.zeros(1)
+    model = mujoco.MjModel.from_xml_string(models.chain(models.pole(), DELAYED))
+    state = np.full(1, 0.3), np.ones(1), np.ones(1)
     with caplog.at_level(logging.WARNING):
         ours = compile_step(model, 20)(*state)
     for x, true in zip(ours, compile_step(model, 20, physics="mujoco")(*state), strict=True):
         np.testing.assert_array_equal(x, true)
     (record,) = caplog.records
-    assert "because of: damping of actuators" in record.getMessage()
+    assert "because of: delay of actuators" in record.getMessage()
     assert abs(float(ours[1][0]) - float(compile_step(model, 20, physics="mjx")(*state)[1][0])) > 0.01
 
 
@@ -164,12 +176,12 @@ def test_mjx_refuses_nothing_that_it_does_not_need(xml):
 
 @pytest.mark.parametrize("name", ["robotiq_2f85/2f85.xml", "unitree_go1/scene.xml", "universal_robots_ur5e/ur5e.xml"])
 def test_published_robots_are_the_same_in_mjx(name):
-    assert_smooth_part_is_mujocos(robots.load(name))
+    assert_smooth_part_is_mujocos(published.load(name))
 
 
-@robots.each_robot
+@published.each_robot
 def test_mjx_takes_published_robots(name):
-    model = robots.load(name)
+    model = published.load(name)
     before = model.geom_type.copy(), model.opt.cone, model.opt.disableflags
     put_model(model)
     assert np.array_equal(before[0], model.geom_type)
@@ -317,7 +329,7 @@ def test_the_check_says_what_scalar_equations_leave_out():
 
 
 def test_the_check_of_what_mujoco_steps_finds_nothing():
-    assert check(models.chain(models.pole(), MOTOR.format('damping="3"'))) == []
+    assert check(models.chain(models.pole(), DELAYED)) == []
 
 
 # --- the description --------------------------------------------------------------------------------------------------
@@ -329,6 +341,6 @@ def test_a_model_is_described():
     assert arm.equations > 20
     found = describe(meshes())
     assert (found.pairs, found.candidates, found.meshes, found.physics) == (3, 0, 2, "scalar")
-    odd = describe(mujoco.MjModel.from_xml_string(models.chain(models.pole(), MOTOR.format('damping="3"'))))
+    odd = describe(mujoco.MjModel.from_xml_string(models.chain(models.pole(), DELAYED)))
     assert (odd.physics, odd.equations) == ("mujoco", 0)
-    assert odd.reason.startswith("damping of actuators")
+    assert odd.reason.startswith("delay of actuators")

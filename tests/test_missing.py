@@ -4,8 +4,8 @@ import logging
 
 import mujoco
 import numpy as np
+import published
 import pytest
-import robots
 
 from envs.physics import MujocoModelError, compile_model, load_spec
 
@@ -138,9 +138,9 @@ def test_missing_textures_change_only_looks(load):
     assert line == "robot: 1 texture file is missing (t.png) and left out, which changes nothing but looks"
 
 
-@robots.each_robot
+@published.each_robot
 def test_published_robots_load(name, caplog):
-    model = robots.load(name)
+    model = published.load(name)
     assert len(caplog.records) == 1
     assert "left out" in caplog.records[0].getMessage()
     data = mujoco.MjData(model)

@@ -10,6 +10,7 @@ from jax import lax
 
 from envs.physics import scalarize
 from envs.physics.interpreter import trace
+from envs.physics.numeric import evaluate
 from envs.physics.rules.sorting import list_exchanges
 
 BATCH = 200  # more than a tile
@@ -17,22 +18,22 @@ EXAMPLES = settings(deadline=None, max_examples=8)
 
 
 def check(fn, *arguments):
-    """The same numbers, for every environment of a batch."""
-    ours = jax.jit(jax.vmap(scalarize(fn, *(x[0] for x in arguments))))(*arguments)
-    theirs = jax.jit(jax.vmap(fn))(*arguments)
-    for mine, true in zip(jax.tree.leaves(ours), jax.tree.leaves(theirs), strict=True):
-        assert mine.dtype == true.dtype
+    """The equations give the same numbers, for every environment of a batch."""
+    program = trace(fn, *(x[0] for x in arguments))
+    theirs = jax.tree.leaves(jax.jit(jax.vmap(fn))(*arguments))
+    for mine, true, result in zip(evaluate(program, arguments), theirs, program.results, strict=True):
+        assert result.dtype == true.dtype
         np.testing.assert_array_equal(mine, true)
 
 
 def numbers(seed, *shape):
     """Whole numbers, so that sums are exact and many are equal."""
-    return jnp.asarray(np.random.default_rng(seed).integers(-4, 5, (BATCH, *shape)), float)
+    return np.random.default_rng(seed).integers(-4, 5, (BATCH, *shape)).astype(np.float32)
 
 
 def indices(seed, *shape, limit=7):
     """Also negative ones and such as lie outside."""
-    return jnp.asarray(np.random.default_rng(seed).integers(-limit, limit + 1, (BATCH, *shape)))
+    return np.random.default_rng(seed).integers(-limit, limit + 1, (BATCH, *shape), np.int32)
 
 
 SEEDS = st.integers(0, 2**16)
@@ -104,7 +105,7 @@ def test_slices(seed, shape, data):
 def test_sorts(seed, size, num_keys, num_values, has_nan):
     """By several keys; rows with equal keys keep their order."""
     x = numbers(seed, num_keys, size)
-    x = jnp.where(x == 3, jnp.nan, jnp.where(x == 2, jnp.inf, x)) if has_nan else x
+    x = np.where(x == 3, np.nan, np.where(x == 2, np.inf, x)).astype(np.float32) if has_nan else x
 
     def fn(x):
         operands = (*x, *(jnp.arange(size) + i for i in range(num_values)))
@@ -126,7 +127,10 @@ def test_orders(seed, shape, data):
 
 
 def test_an_order_of_many():
-    check(jnp.sort, jnp.asarray(np.random.default_rng(0).normal(size=(BATCH, 33)), jnp.float32))
+    """Also compiled."""
+    x = np.random.default_rng(0).normal(size=(BATCH, 33)).astype(np.float32)
+    check(jnp.sort, x)
+    np.testing.assert_array_equal(jax.jit(jax.vmap(scalarize(jnp.sort, x[0])))(x), np.sort(x))
 
 
 @pytest.mark.parametrize("size", range(11))
@@ -148,10 +152,10 @@ def test_derivatives(seed, shape):
         ordered = lax.sort((x[:, 0], 2 * x[:, -1]), num_keys=1)
         return jnp.sum(x.at[i[0]].add(x[0]) ** 2) + x[i[0] % shape[0], i[1] % shape[1]] + ordered[0] @ ordered[1]
 
-    x = numbers(seed, *shape) + 0.01 * jnp.arange(shape[0])[:, None]
+    x = numbers(seed, *shape) + 0.01 * np.arange(shape[0], dtype=np.float32)[:, None]
     i = indices(seed, 2)
-    ours = jax.vmap(jax.grad(scalarize(fn, x[0], i[0])))(x, i)
-    np.testing.assert_allclose(ours, jax.vmap(jax.grad(fn))(x, i), rtol=1e-5, atol=1e-5)
+    ours, theirs = (jax.jit(jax.vmap(jax.grad(f)))(x, i) for f in (scalarize(fn, x[0], i[0]), fn))
+    np.testing.assert_allclose(ours, theirs, rtol=1e-5, atol=1e-5)
 
 
 def test_equal_elements_need_no_select():

@@ -4,10 +4,11 @@ import itertools
 
 import mujoco
 import numpy as np
+import published
 import pytest
-import robots
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scipy.optimize import lsq_linear
 
 from envs.physics import reach
 from envs.physics.pairs import candidate_pairs, colliding_pairs, find_margin
@@ -160,10 +161,10 @@ def random_positions(model, number):
         yield qpos
 
 
-@robots.each_robot
+@published.each_robot
 def test_no_contact_of_a_published_robot_is_missed(name):
     """In positions within the widened ranges, by MuJoCo's own collision detection."""
-    model = robots.load(name)
+    model = published.load(name)
     data = mujoco.MjData(model)
     kept = {frozenset((pair.geom1, pair.geom2)) for pair in candidate_pairs(model)}
     for qpos in random_positions(model, 20_000):
@@ -176,7 +177,7 @@ def test_no_contact_of_a_published_robot_is_missed(name):
 
 @pytest.mark.parametrize("name", ["unitree_go1/scene.xml", "aloha/aloha.xml", "universal_robots_ur5e/ur5e.xml"])
 def test_pairs_of_published_robots_get_fewer(name):
-    model = robots.load(name)
+    model = published.load(name)
     before, after = colliding_pairs(model), candidate_pairs(model)
     assert set(after) < set(before)
     assert len(after) < 0.85 * len(before)
@@ -243,6 +244,21 @@ def test_crossing_capsules_have_the_distance_of_inner_points():
     search = reach._Search(Reach(model), [], [(0, 1, 0.0)], np.array([0, 1]), np.array([0]), np.array([1]))
     (ours,), _ = search.bound(np.zeros((1, 0)), np.zeros((1, 0)))
     np.testing.assert_allclose(ours[0], 0.25)
+
+
+def test_the_gap_of_segments_is_the_least():
+    """As of bounded least squares: skew, parallel and nearly parallel, crossing segments, and points."""
+    random = np.random.default_rng(0)
+    offset, u, v = random.normal(size=(3, 100, 3))
+    v[::4] = u[::4] * random.uniform(-2, 2, (25, 1))
+    v[1::4] = u[1::4] + 1e-7 * random.normal(size=(25, 3))
+    offset[::3] *= 0.05
+    u[::10], v[::15] = 0, 0
+    lengths = np.linalg.norm(u, axis=1), np.linalg.norm(v, axis=1)
+    ours = np.linalg.norm(reach.find_gap(offset, u, v, *lengths, reach.PARALLEL), axis=1)
+    columns = np.stack([u, -v], 2)
+    least = [lsq_linear(a, -b, (-1, 1), tol=1e-15) for a, b in zip(columns, offset, strict=True)]
+    np.testing.assert_allclose(ours, [np.sqrt(2 * each.cost) for each in least], rtol=1e-7, atol=1e-7)
 
 
 def test_capsules_enclose_the_geoms():

@@ -7,9 +7,11 @@ import types
 
 import jax
 import jax.numpy as jnp
+import mujoco
 import numpy as np
 import pytest
 from flax import struct
+from mujoco import mjx
 
 import envs
 from envs.hints import pip_install
@@ -106,6 +108,119 @@ def test_evaluations_have_its_metrics():
     np.testing.assert_allclose(episodes.episode_return, 3 * starts + 1.5, rtol=1e-6)
 
 
+ROD = """<mujoco><option timestep="0.01"/><worldbody><body name="rod"><joint name="hinge" axis="0 1 0"/>
+<geom type="capsule" fromto="0 0 0 0 0 .5" size=".02" contype="0" conaffinity="0"/><site name="tip" pos="0 0 .5"/>
+</body></worldbody><actuator><motor joint="hinge"/></actuator><sensor><velocimeter site="tip"/></sensor></mujoco>"""
+
+
+class Rod:
+    """An environment in Playground's way: it reads a pose and a sensor, and pushes the rod at random."""
+
+    action_size, n_substeps = 1, 3
+
+    def __init__(self):
+        self.mj_model, self.mjx_model = mujoco.MjModel.from_xml_string(ROD), None
+
+    def reset(self, rng):
+        qpos = jax.random.uniform(rng, (1,), minval=-1)
+        data = mjx_env.make_data(self.mj_model, qpos=qpos, qvel=jnp.ones(1), impl="jax", njmax=3)
+        return self.observe(mjx.forward(self.mjx_model, data), {"push": 10.0 * qpos[0]})
+
+    def step(self, state, action):
+        data = state.data.replace(xfrc_applied=jnp.zeros((2, 6)).at[1, 0].set(state.info["push"]), time=0.0)
+        return self.observe(mjx_env.step(self.mjx_model, data, action, self.n_substeps), state.info)
+
+    def observe(self, data, info):
+        obs = jnp.concatenate([data.site_xpos[0], data.sensordata, data.qpos, data.qvel])
+        return State(data, obs, data.qpos[0] ** 2, 1.0 * (data.qvel[0] > 50), {}, info)
+
+
+class Seeing(Rod):
+    """Reads something that only MJX has."""
+
+    def observe(self, data, info):
+        return super().observe(data.replace(qvel=data.qvel + data.contact.dist.sum()), info)
+
+
+mjx_env = types.ModuleType("mujoco_playground._src.mjx_env")
+
+
+@pytest.fixture
+def functions(monkeypatch):
+    """The module whose functions Playground's environments call; those of this one are never called."""
+    for name in ("make_data", "step"):
+        monkeypatch.setattr(mjx_env, name, name, raising=False)
+    for name, content in (("mujoco_playground", {}), ("mujoco_playground._src", {"mjx_env": mjx_env})):
+        module = types.ModuleType(name)
+        vars(module).update(content)
+        monkeypatch.setitem(sys.modules, name, module)
+    before = mjx.forward
+    yield
+    assert (mjx_env.make_data, mjx_env.step, mjx.forward) == ("make_data", "step", before)
+
+
+def play_rod(qpos, actions):
+    """The observations that C MuJoCo gives, from the reset on."""
+    model = mujoco.MjModel.from_xml_string(ROD)
+    data = mujoco.MjData(model)
+    data.qpos, data.qvel = qpos, 1.0
+    mujoco.mj_forward(model, data)
+
+    def observe():
+        return np.concatenate([data.site_xpos[0], data.sensordata, data.qpos, data.qvel])
+
+    yield observe()
+    data.xfrc_applied[1, 0] = 10.0 * qpos
+    for action in actions:
+        data.ctrl = action
+        mujoco.mj_step(model, data, Rod.n_substeps)
+        yield observe()
+
+
+@pytest.mark.parametrize("physics", ["scalar", "mujoco"])
+def test_environments_step_as_by_c_mujoco(functions, physics):
+    """Observations after a reset, and after steps under an action, a push and three substeps."""
+    actions = np.array([[1.0], [-0.5], [0.2]])
+    with jax.enable_x64(True):
+        env = Playground(Rod(), physics)
+        state = jax.jit(env.reset)(jax.random.key(0))
+        qpos = float(state.pipeline_state.data.qpos[0])
+        observed = [state.obs]
+        for action in actions:
+            state = jax.jit(env.step)(state, action)
+            observed.append(state.obs)
+    np.testing.assert_allclose(observed, list(play_rod(qpos, actions)), atol=1e-12)
+
+
+def test_the_data_has_what_is_used_and_no_more(functions):
+    data = jax.eval_shape(Playground(Rod(), "scalar").reset, jax.random.key(0)).pipeline_state.data
+    paths = [jax.tree_util.keystr(path) for path, _ in jax.tree_util.tree_leaves_with_path(data)]
+    names = ["ctrl", "qacc_warmstart", "qpos", "qvel", "sensordata", "site_xpos", "time", "xfrc_applied"]
+    assert paths == [f".{name}" for name in names]
+
+
+def test_what_only_mjx_has_is_one_line(functions):
+    with pytest.raises(OptionError, match=r"^Seeing reads data.contact, which only MJX has: env.physics=mjx$"):
+        Playground(Seeing(), "scalar")
+
+
+def test_a_mistake_in_an_environment_is_not_hidden(functions):
+    class Wrong(Rod):
+        def observe(self, data, info):
+            return self.nothing
+
+    with pytest.raises(AttributeError, match="nothing"):
+        Playground(Wrong(), "scalar")
+
+
+def test_a_batch_of_them_is_trained_as_any_other(functions):
+    vector = vectorize(Playground(Rod(), "scalar"), 3, 4)
+    start = vector.reset(jax.random.key(0))
+    _, steps = rollout(hopping, vector.step, start, jax.random.key(1), 4)
+    np.testing.assert_array_equal(steps.truncated[:, 0], [0, 0, 0, 1])
+    assert len(np.unique(steps.obs[:, :, 0])) == 12
+
+
 @pytest.fixture
 def playground(monkeypatch):
     """A package of that name, with one environment; what loading it raises is what `broken` holds."""
@@ -132,7 +247,7 @@ def complaint(**options):
 
 
 def test_made_by_name(playground):
-    assert isinstance(envs.make("playground", name="HopperHop").unwrapped, Hopper)
+    assert isinstance(envs.make("playground", name="HopperHop", physics="mjx").unwrapped, Hopper)
 
 
 def test_unknown_names_are_answered_with_the_nearest(playground):
@@ -157,6 +272,17 @@ def test_what_cannot_be_made_is_one_line(playground, error, words):
 def test_a_missing_package_is_one_line(monkeypatch):
     monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
     assert complaint() == f"env=playground needs MuJoCo Playground: {pip_install('playground')}"
+
+
+def test_the_real_one_moves_by_the_equations_as_by_mjx():
+    pytest.importorskip("mujoco_playground", reason="pip install playground")
+
+    def play(physics):
+        env = envs.make("playground", physics=physics)
+        state = env.reset(jax.random.key(0))
+        return jax.lax.scan(lambda state, action: (env.step(state, action),) * 2, state, jnp.ones((5, 1)))[1].obs
+
+    np.testing.assert_allclose(play("scalar"), play("mjx"), atol=1e-6)
 
 
 def test_the_real_one_balances_for_a_moment():

@@ -72,6 +72,7 @@ def test_sigma_follows_its_schedule(algo):
         np.testing.assert_allclose(metrics["sigma"], 0.8 * (0.05 / 0.8) ** (np.arange(updates) / updates), rtol=1e-4)
 
 
+@pytest.mark.optimized
 def test_other_parameters_learn_as_ever_while_sigma_is_scheduled():
     """The first step: that of a learned sigma, but for sigma."""
     steps = []

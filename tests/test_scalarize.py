@@ -402,6 +402,7 @@ def test_gradients_through_vmap_and_scan():
     np.testing.assert_allclose(ours, theirs, rtol=1e-5)
 
 
+@pytest.mark.optimized  # whose error at 1e5 is small thanks to fused multiply-adds
 @pytest.mark.parametrize("limit", [1.0, 100.0, 1e5])
 def test_sine_and_cosine(limit):
     """Within 2 units in the last place of 1 of the float64 values."""

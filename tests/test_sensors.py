@@ -7,9 +7,7 @@ import numpy as np
 import pytest
 from dynamics import BODIES, TENDONS, compile_unconstrained, draw_state, make_function, write_mjcf
 
-from envs.physics.dynamics import forward
 from envs.physics.interpreter import trace
-from envs.physics.models import put_model
 
 ACTUATORS = """<actuator><motor name="m" joint="j1" gear="3"/><position joint="j1" kp="3"/><motor tendon="t1"/>
 <motor tendon="t2"/></actuator>"""
@@ -83,26 +81,3 @@ def test_kinetic_energy_is_that_of_the_bodies(values):
         (ours,) = dynamics.compute(lambda *args: function(*args)["sensordata"], *arguments)
     address = model.sensor_adr[NAMES.index("e_kinetic")]
     np.testing.assert_allclose(ours[address], energy, rtol=1e-12)
-
-
-def test_sensors_of_constraints_are_handed_in():
-    """What `sense` returns takes the place of the sensor, before its cutoff; external forces enter force sensors."""
-    model = compile_unconstrained(
-        write_mjcf(extra='<sensor><touch site="s3" cutoff="2"/><force site="s4"/><force site="s4"/></sensor>')
-    )
-    mx = put_model(model)
-    force = np.zeros((model.nbody, 3))
-    force[-1, 2] = 5.0
-
-    def sense(*_):
-        return {0: np.array([7.0]), "external": (force, np.zeros((model.nbody, 3)))}
-
-    def read(qpos):
-        d = start.replace(qpos=qpos)
-        return tuple(forward.forward(model, mx, d, forward.unconstrained, x).sensordata for x in (None, sense))
-
-    with jax.enable_x64(True):
-        start = dynamics.mjx.make_data(mx)
-        without, with_it = dynamics.compute(read, model.qpos0)
-    assert with_it[0] == 2.0
-    np.testing.assert_allclose(np.linalg.norm(with_it[1:4] - without[1:4]), 5.0)

@@ -19,7 +19,7 @@ from jaxpg.estimators import gae, normalize_advantages
 from jaxpg.methods import td
 from jaxpg.nonfinite import stop_at_nonfinite
 from jaxpg.ppo import minibatch_steps, ppo, ppo_loss
-from jaxpg.shards import AXIS, map_in_parts, shard
+from jaxpg.shards import AXIS, shard
 from jaxpg.training import initial_state, train_scan
 from jaxpg.updates import actor_critic_loss, gradient_step
 from jaxpg.vector_env import episode_metrics, vectorize
@@ -148,15 +148,6 @@ def test_each_part_has_random_numbers_of_its_own():
     first, second = np.split(np.asarray(state.env_state.obs), 2)
     assert not np.isin(first[:, 0], second[:, 0]).any()
     assert len(jax.tree.leaves(state.params)[0].sharding.device_set) == 2  # every device has them
-
-
-@pytest.mark.parametrize("devices", [1, 2])
-def test_rows_computed_in_parts_are_the_rows(devices):
-    rows = jnp.arange(12.0).reshape(6, 2)
-    by_parts = jax.jit(
-        map_in_parts(lambda factor, rows: {"sum": factor * rows.sum(axis=1)}, 2, jax.devices()[:devices])
-    )
-    np.testing.assert_array_equal(by_parts(3.0, rows)["sum"], 3 * rows.sum(axis=1))
 
 
 # --- whole runs -------------------------------------------------------------------------------------------------------

@@ -6,10 +6,12 @@ import sys
 from pathlib import Path
 
 import jax
+import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
 from dynamics import mjx
+from scipy.spatial.transform import Rotation
 
 from envs.physics import compile_step
 from envs.physics.dynamics import forward
@@ -18,7 +20,7 @@ from envs.physics.dynamics.watch import MANY_PAIRS, _list_solids, may_touch
 from envs.physics.interpreter import trace
 from envs.physics.models import put_model
 from envs.physics.numeric import evaluate
-from envs.physics.pairs import colliding_pairs
+from envs.physics.pairs import colliding_pairs, find_margin
 
 SHAPES = {
     "sphere": 'type="sphere" size="{0}"',
@@ -100,11 +102,19 @@ def test_what_touches_a_plane_is_flagged(shape, in_float64):
 
 
 def test_bundles_of_a_body(in_float64):
-    """Of very many pairs a body's spheres and capsules are one capsule around them."""
+    """Of very many pairs a body's spheres and capsules are one capsule around them, and its boxes one box."""
     rng = np.random.default_rng(0)
     line = [f'<geom size=".05" pos="0 0 {0.07 * i}"/>' for i in range(6)]
     line += [f'<geom type="capsule" size=".04 .1" pos=".03 0 {0.1 * i}" quat="1 .1 0 0"/>' for i in range(5)]
     model = floating([line, line, [make_geom("box", rng), '<geom size=".05" pos=".4 0 0"/>']])
+    check_bundles(model)
+    box = '<geom type="box" size=".1 .05 .07" pos="{} {} 0" quat="1 .05 -.03 {}"/>'
+    row = [box.format(0.1 * i, 0.02 * (i % 2), 0.01 * i) for i in range(9)]
+    check_bundles(floating([row, [*row, make_geom("cylinder", rng)]]))
+
+
+def check_bundles(model):
+    """They are few, and neither miss a contact nor say too often that there may be one."""
     pairs = colliding_pairs(model)
     assert len(pairs) > MANY_PAIRS
     assert len(_list_solids(model, pairs)) < len(pairs) / 5
@@ -120,6 +130,54 @@ def test_what_is_far_is_not_flagged(in_float64):
     model = floating([[make_geom(shape, rng)] for shape in SHAPES])
     ours, _ = compare(model, 30.0, 50)
     assert ours.sum() < 3
+
+
+LONG = (0.3, 0.5, 3.0)  # m, half-lengths of capsules
+ROUNDING = 1e-6  # m
+
+
+def draw_crossings(rng, number, reach):
+    """Poses `[number, 3, 7]` of capsules, at angles of 1e-6 to 1e-2 rad or any, whose lines meet within or near them.
+
+    Or come as near as some share of `reach`, across the lines in any direction.
+    """
+    shape = number, 3
+    angle = np.where(rng.random(shape) < 0.9, 10 ** rng.uniform(-6, -2, shape), rng.uniform(0, 3, shape))
+    along = rng.uniform(-1.2, 1.2, shape) * LONG
+    across = rng.uniform(-1.2, 1.2, (number, 3, 2)) * reach * rng.integers(0, 2, (number, 1, 1))
+    frame = Rotation.random(number, rng)
+    turned = [frame * Rotation.from_rotvec(np.outer(x, [1.0, 0.0, 0.0])) for x in angle.T]
+    middle = [
+        each.apply(np.append(x, -z[:, None], 1))
+        for each, x, z in zip(turned, across.swapaxes(0, 1), along.T, strict=True)
+    ]
+    poses = [np.append(x, each.as_quat(scalar_first=True), 1) for x, each in zip(middle, turned, strict=True)]
+    return np.stack(poses, 1).astype(np.float32)
+
+
+@pytest.mark.parametrize("radius", [0.0001, 0.002, 0.05])
+def test_nearly_parallel_capsules_are_flagged(radius):
+    """In single precision: who is nearer than the margin by C MuJoCo's distance is flagged, and few others."""
+    model = floating([[f'<geom type="capsule" size="{radius} {x}" margin="1e-4" mass="1"/>'] for x in LONG])
+    data, mx = mujoco.MjData(model), put_model(model)
+    start, pairs = mjx.make_data(mx), colliding_pairs(model)
+    margin = find_margin(model, pairs[0])
+
+    def watch(qpos):
+        d, _ = forward.find_positions(model, mx, start.replace(qpos=qpos))
+        return jnp.stack([may_touch(model, d, [pair]) for pair in pairs])
+
+    qpos = draw_crossings(np.random.default_rng(0), 3000, 2 * radius + margin)
+    (ours,) = evaluate(trace(watch, qpos[0].ravel()), [qpos.reshape(len(qpos), -1)])
+    distance = np.zeros((len(qpos), len(pairs)))
+    for i, each in enumerate(qpos):
+        data.qpos[:] = each.ravel()
+        mujoco.mj_kinematics(model, data)
+        distance[i] = [mujoco.mj_geomDistance(model, data, pair.geom1, pair.geom2, 1.0, None) for pair in pairs]
+    near = distance < margin - ROUNDING
+    assert 0.1 < near.mean() < 0.9
+    assert not (near & ~ours).any()
+    assert not (ours & (distance > margin + 0.005)).any()
 
 
 # --- which pairs are watched ------------------------------------------------------------------------------------------
@@ -138,19 +196,85 @@ def arms(options="", floor="", more=""):
 
 
 def test_what_never_touches_by_itself_is_watched():
-    """And contacts with the floor are written out, as is what touches while nothing is commanded."""
-    model = arms(floor=PLANE, more='<body pos="2 0 .5"><freejoint/><geom size=".1"/></body>')
+    """And the contact of a free ball with the floor is written out, as is what touches while nothing is commanded."""
+    model = arms(floor=PLANE, more='<body pos="2 0 9"><freejoint/><geom name="ball" size=".1"/></body>')
     pairs = colliding_pairs(model)
     chosen, watched = choose_pairs(model, pairs)
-    floor = model.geom("floor").id
-    assert {pair for pair in pairs if floor in (pair.geom1, pair.geom2)} == set(chosen)
+    assert [(pair.geom1, pair.geom2) for pair in chosen] == [(model.geom("floor").id, model.geom("ball").id)]
     assert set(chosen) | set(watched) == set(pairs)
     assert not set(chosen) & set(watched)
-    assert len(watched) == 8
+    assert len(watched) == 12
     box = '<body pos="2 0 {}"><freejoint/><geom name="{}" type="box" size=".2 .2 .1"/></body>'
     stacked = arms(floor=PLANE, more=box.format(0.1, "low") + box.format(0.299, "high"))
     touching = {(stacked.geom("low").id, stacked.geom("high").id)}
     assert touching <= {(pair.geom1, pair.geom2) for pair in choose_pairs(stacked, colliding_pairs(stacked))[0]}
+
+
+@pytest.mark.parametrize(
+    ("joint", "gravity", "is_chosen"),
+    [
+        ('type="free"', 0, True),
+        ('type="slide" axis="1 0 0"', 0, True),
+        ('type="slide" axis="1 0 0" range="-.1 .1"', 0, False),
+        ('type="hinge" axis="0 1 0"', 0, False),
+        ('type="hinge" axis="0 1 0"', -10, True),
+    ],
+)
+def test_planes_of_robots_on_a_base(joint, gravity, is_chosen):
+    """Who stays on a base gets the contact with the plane only if it touches it, here as it falls on it."""
+    link = f'<body pos="0 0 .2"><joint {joint}/><geom type="capsule" fromto="0 0 0 .4 0 .1" size=".04"/></body>'
+    text = f'<mujoco><option gravity="0 0 {gravity}"/><worldbody>{PLANE}{link}</worldbody></mujoco>'
+    model = mujoco.MjModel.from_xml_string(text)
+    pairs = colliding_pairs(model)
+    assert len(pairs) == 1
+    assert choose_pairs(model, pairs) == ((pairs, []) if is_chosen else ([], pairs))
+
+
+def make_gripper(place, geoms):
+    """Two fingers at this distance (m) from the middle, which servos close by up to 4 cm each."""
+    finger = f'<joint name="{{0}}" type="slide" axis="{{1}} 0 0" range="0 .04"/>{geoms}</body>'
+    fingers = f'<body pos="-{place} 0 0">{finger.format("l", 1)}<body pos="{place} 0 0">{finger.format("r", -1)}'
+    servo = '<position joint="{}" kp="1" kv=".3" ctrlrange="0 .04"/>'
+    return mujoco.MjModel.from_xml_string(f"""<mujoco><compiler autolimits="true"/><option gravity="0 0 0"/>
+    <worldbody>{fingers}</worldbody><actuator>{servo.format("l")}{servo.format("r")}</actuator></mujoco>""")
+
+
+@pytest.mark.parametrize(
+    ("place", "shape", "is_chosen"),
+    [
+        (0.02, 'size=".01"', True),
+        (0.044, 'size=".01"', False),
+        (0.05, 'size=".01"', False),
+        (0.02, 'type="box" size=".01 .01 .01"', False),
+    ],
+)
+def test_fingers_that_close_under_commands_are_chosen(place, shape, is_chosen):
+    """Not if they touch in 2 % of the steps or never do, and not as boxes, whose contact costs much."""
+    model = make_gripper(place, f"<geom {shape}/>")
+    pairs = colliding_pairs(model)
+    assert len(pairs) == 1
+    assert choose_pairs(model, pairs) == ((pairs, []) if is_chosen else ([], pairs))
+
+
+def test_fingers_that_meet_are_chosen_with_all_their_geoms():
+    """The second spheres never touch in the simulations, but they are cheap, and near."""
+    spheres = '<geom size=".01"/><geom size=".004" pos="0 0 .02"/>'
+    model = make_gripper(0.02, spheres)
+    pairs = [pair for pair in colliding_pairs(model) if pair.geom2 - pair.geom1 == 2]
+    assert len(pairs) == 2
+    assert choose_pairs(model, pairs) == (pairs, [])
+    assert choose_pairs(model, pairs[1:]) == ([], pairs[1:])
+
+
+def test_simulations_that_diverge_say_nothing(tmp_path, monkeypatch, capfd):
+    """What C MuJoCo does after a restart is not counted, and it neither prints its warning nor writes a file of it."""
+    monkeypatch.chdir(tmp_path)
+    joint = '<joint axis="0 1 0" range="-9 9" damping="-99"/>'
+    link = f'<body pos="0 0 .3">{joint}<geom type="capsule" fromto="0 0 0 .4 0 .1" size=".04"/></body>'
+    model = mujoco.MjModel.from_xml_string(f"<mujoco><worldbody>{PLANE}{link}</worldbody></mujoco>")
+    choose_pairs(model, colliding_pairs(model))
+    assert list(tmp_path.iterdir()) == []
+    assert "".join(capfd.readouterr()) == ""
 
 
 def test_contacts_are_bounded():

@@ -46,6 +46,10 @@ UNSPRUNG = arm('<motor joint="a"/>', joint='stiffness="1" damping="1"').replace(
 )
 MUSCLE = '<muscle joint="a" force="300" range=".75 1.05" lengthrange="-1 1"/>'
 FILTER = '<general joint="a" dyntype="filter" dynprm="0.1" gainprm="5" {}/>'
+MOTOR = "<motor joint='a'/>"
+CRANK = arm('<motor cranksite="s" slidersite="rail" cranklength="1"/>').replace(
+    "<worldbody>", '<worldbody><site name="rail" pos="1 0 0" quat="1 0 1 0"/>'
+)
 CHAIN = [20.0, -20.0, 15.0, 0.0]  # velocities that close the loop
 BOX = 'type="box" size=".1 .1 .1"'
 # by row of the table: models, with velocities and a control, and the number of steps
@@ -70,7 +74,13 @@ ROWS = {
         (falling("ellipsoid", BOX), [0.1, 0.0, 0.0, 0.0, 0.3, 0.2], 0.0, 20),
     ],
     "elliptic cones of contacts without friction": [(CONE, [0.0] * 6, 0.0, 5)],
-    "polynomial stiffness": [(arm("<motor joint='a'/>", joint='stiffness="1 20"'), [3.0], 0.0, 100)],
+    "polynomial stiffness and damping": [(arm(MOTOR, joint='stiffness="1 20" damping="1 2"'), [3.0], 0.0, 100)],
+    "damping and armature of actuators, disabled groups": [
+        (arm(MOTOR.replace("/>", ' damping="3"/>')), [3.0], 0.0, 20),
+        (arm(MOTOR.replace("/>", ' armature="3"/>')), [0.0], 1.0, 20),
+        (arm(MOTOR.replace("/>", ' group="1"/>'), 'actuatorgroupdisable="1"'), [0.0], 1.0, 20),
+    ],
+    "slider-cranks": [(CRANK, [1.0], 1.0, 20)],
 }
 CASES = [pytest.param(*case, id=f"{row} {number}") for row, cases in ROWS.items() for number, case in enumerate(cases)]
 

@@ -30,7 +30,7 @@ def main(arguments: Sequence[str]) -> int:
     if options.backend == "mujoco":
         changes |= _make_mujoco_changes(options.run)
     with physics_cache(options.cache):
-        stored = policies.load(options.run, options.checkpoint, options.agent, changes)
+        stored = policies.load(options.run, options.checkpoint, options.agent, changes, divided=options.policy == "jax")
     play = episodes.play_gymnasium if options.backend == "gymnasium" else episodes.play_native
     with _choose_player(stored, options.policy) as player, compilation_cache(options.cache, print):
         results = play(player, options.episodes, options.seed)

@@ -21,13 +21,15 @@ RUN_ONCE: dict[str, Any]
 OPTIMIZED, RUN_ONCE = ({"xla_backend_optimization_level": level} for level in (2, 0))
 
 
-def prepare(config: Config, threads: int | None = None) -> None:
+def prepare(config: Config, threads: int | None = None, divided: bool = False) -> None:
     """Starts the backend with a fixed number of XLA threads, as the bits of large reductions depend on it.
 
     Args:
       config: configuration of the run. Environments of other libraries call LAPACK, which needs a single thread on some
         jaxlib releases.
       threads: number of threads of the run being resumed; by default `count_threads`.
+      divided: whether each thread has a device of its own, over which `envs.batches.divide_batch` divides episodes, and
+        not each shard of a training.
 
     Raises:
       UserError: an environment variable sets JAX up in a way that training does not support.
@@ -35,9 +37,10 @@ def prepare(config: Config, threads: int | None = None) -> None:
     _check_variables()
     if threads is None and config.choices["env"] in LIBRARIES and may_deadlock(jaxlib.version.__version__):
         threads = 1
-    os.environ["PJRT_NPROC"] = str(threads or count_threads())
+    threads = threads or count_threads()
+    os.environ["PJRT_NPROC"] = str(threads)
     with contextlib.suppress(RuntimeError):  # raised if the backend has already started
-        jax.config.update("jax_num_cpu_devices", config.num_shards)
+        jax.config.update("jax_num_cpu_devices", threads if divided else config.num_shards)
     try:
         jax.devices()
     except (RuntimeError, AssertionError) as error:  # the latter has no message, if there is no plugin for the platform

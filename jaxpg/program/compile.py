@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import functools
-import math
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from typing import NamedTuple
@@ -13,7 +12,7 @@ import jax
 import numpy as np
 
 from envs.base import Env
-from jaxpg import shards
+from envs.batches import divide_batch
 from jaxpg.config.configuration import Config
 from jaxpg.evaluation import Episodes, evaluate
 from jaxpg.nonfinite import skip_nonfinite, stop_at_nonfinite
@@ -120,8 +119,7 @@ def _make_agent_functions(config: Config, env: Env, chunk: int) -> tuple[Callabl
 
     def play(policy):
         starts = jax.random.split(jax.random.key(SELECTION_SEED), run.eval_episodes)
-        parts = math.gcd(run.eval_episodes, config.num_shards)
-        return shards.map_in_parts(play_from, parts, jax.devices())(policy, starts)
+        return divide_batch(play_from, (None, 0), jax.devices()[: config.num_shards])(policy, starts)
 
     return init, advance, play
 

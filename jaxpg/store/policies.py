@@ -57,7 +57,11 @@ class StoredPolicy(NamedTuple):
 
 
 def load(
-    run: str, which: str = "best", agent: int | None = None, changes: Mapping[str, Any] | None = None
+    run: str,
+    which: str = "best",
+    agent: int | None = None,
+    changes: Mapping[str, Any] | None = None,
+    divided: bool = False,
 ) -> StoredPolicy:
     """A policy from a run folder.
 
@@ -66,28 +70,33 @@ def load(
       which: "best" (by the evaluations during training) or "last".
       agent: index of the agent, from 0; None takes the one with the best evaluation.
       changes: options to change, by dotted name; only `env.*` makes sense here.
+      divided: whether the process gets a device for each core (`jaxpg.program.backend.prepare`).
 
     Raises:
       UserError: there is no run folder or no checkpoint, the checkpoint belongs to another run, or there is no such
         agent.
     """
-    (stored,) = load_several(run, [which], agent, changes)
+    (stored,) = load_several(run, [which], agent, changes, divided)
     return stored
 
 
 def load_several(
-    run: str, kinds: Sequence[str], agent: int | None = None, changes: Mapping[str, Any] | None = None
+    run: str,
+    kinds: Sequence[str],
+    agent: int | None = None,
+    changes: Mapping[str, Any] | None = None,
+    divided: bool = False,
 ) -> list[StoredPolicy]:
     """Policies of the same agent in the same environment.
 
     Args:
-      run, agent, changes: as in `load`.
+      run, agent, changes, divided: as in `load`.
       kinds: each "best" or "last".
     """
     run_folder = folder.find(run)
     stored = config_file.load(run_folder.config)
     config = configuration.change(stored, changes or {})
-    prepare(config)  # without this, environments of other libraries may hang
+    prepare(config, divided=divided)  # without this, environments of other libraries may hang
     env = make_env(config)
     shape = _make_template(config, env)
     best, update = _restore(Checkpoints(run_folder.best, read_only=True), shape, stored)

@@ -9,6 +9,7 @@ import jax
 import numpy as np
 
 import envs
+from envs.batches import divide_batch
 from envs.hints import pip_install
 from jaxpg.errors import UserError
 from jaxpg.evaluation import evaluate
@@ -32,14 +33,13 @@ class Results(NamedTuple):
 
 
 def play_native(stored: StoredPolicy, num_episodes: int, seed: int) -> Results:
-    """Episodes in the environment that the policy was trained on; the seed fixes the starts."""
+    """Episodes in the environment that the policy was trained on, on all devices; the seed fixes the starts."""
 
-    @jax.jit
-    def play(policy, key):
-        act = functools.partial(stored.act, policy)
-        return evaluate(stored.env, act, jax.random.split(key, num_episodes), stored.config.env.episode_length)
+    def play(policy, starts):
+        return evaluate(stored.env, functools.partial(stored.act, policy), starts, stored.config.env.episode_length)
 
-    episodes = jax.tree.map(np.asarray, play(stored.policy, jax.random.key(seed)))
+    starts = jax.random.split(jax.random.key(seed), num_episodes)
+    episodes = jax.tree.map(np.asarray, divide_batch(play, (None, 0))(stored.policy, starts))
     returns = penalize_diverged(episodes.episode_return, episodes.diverged)
     return Results(returns, episodes.diverged, rename_metrics(episodes.metrics))
 
