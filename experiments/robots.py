@@ -1,6 +1,6 @@
 """Claim: robots as they are published step faster as scalar equations than in C MuJoCo on all cores.
 
-    python experiments/robots.py [robots=FOLDER] [FILE ...] [--envs 1024] [--steps 50] [--rounds 5]
+    python experiments/robots.py [robots=FOLDER] [FILE ...] [--envs 1024] [--steps 50] [--rounds 5] [--memory]
 
 For every model file (by default those of envs/assets; with `robots=FOLDER` all that are in it), environment steps per
 second of
@@ -10,12 +10,16 @@ second of
     C       mujoco.batch and mujoco.rollout on all cores, one call for all steps of all environments: the faster one
 
 with the model's own settings, from a keyframe or else the initial position, with random velocities of 0.1 rad/s or m/s.
-Controls are random, and held: over the whole range of each actuator ("all"), or within 5 % of it around those of the
-keyframe, or else the middle ("calm"). Meshes collide on neither side. One process; in each round one after the other,
-so that a ratio compares neighbours in time. What may touch beyond the contacts of the equations is left to C MuJoCo:
-the share of such steps is counted on C MuJoCo's own motion. Also: by how much positions differ from C MuJoCo's at the
-end of all steps (median of the environments and 99 % of them), and how much faster ours is for each second of a core's
-time, which a busy machine hardly changes.
+Every solver starts from the acceleration of the last step. Controls are random, and held: over the whole range of each
+actuator ("all"), or within 5 % of it around those of the keyframe, or else the middle ("calm"). Meshes collide on
+neither side. One process; in each round one after the other, so that a ratio compares neighbours in time. What may
+touch beyond the contacts of the equations is left to C MuJoCo: the share of such steps is counted on C MuJoCo's own
+motion. Also: by how much positions differ from C MuJoCo's at the end of all steps (median of the environments and 99 %
+of them), and how much faster ours is for each second of a core's time, which a busy machine hardly changes.
+
+Bytes for each environment are those that the compiled loop wants beside the states. With `--memory` each model is also
+traced and compiled in a process of its own, whose largest resident memory (Linux) is printed: before, when libraries
+and the model are loaded, and after.
 
 Prints one table and writes results/robots.json: medians of the rounds with the smallest and the largest.
 """
@@ -23,6 +27,7 @@ Prints one table and writes results/robots.json: medians of the rounds with the 
 from __future__ import annotations
 
 import contextlib
+import multiprocessing
 import os
 import time
 from collections.abc import Callable, Sequence
@@ -38,17 +43,27 @@ import numpy as np
 from commands import Parser, count, write_json
 
 from envs.base import ASSETS
-from envs.physics import MujocoModelError, change_collision, compile_model, compile_step, describe, load_spec, scalarize
+from envs.physics import (
+    MujocoModelError,
+    change_collision,
+    compile_model,
+    compile_step,
+    describe,
+    divide_batch,
+    load_spec,
+    scalarize,
+)
 from envs.physics.dynamics.choice import choose_pairs, count_points
 from envs.physics.dynamics.forward import find_positions
 from envs.physics.dynamics.watch import may_touch
 from envs.physics.models import import_mjx, put_model
 from envs.physics.pairs import candidate_pairs
+from envs.physics.step import WARMSTART
 from jaxpg.commands.ending import run_command
 from jaxpg.errors import UserError
-from jaxpg.shards import map_in_parts
 
 CORES = len(os.sched_getaffinity(0))
+STATUS = Path("/proc/self/status")  # of a process, on Linux
 SECONDS = 0.3  # that one measurement lasts, at least
 FOLDER = "robots="
 CONTROLS = {"all": 1.0, "calm": 0.05}  # which part of each actuator's range is drawn from
@@ -85,20 +100,20 @@ class Compiled:
     """Many steps of a batch in one scan, divided over the cores."""
 
     def __init__(self, model: mujoco.MjModel, states: dict, num_steps: int, physics: str):
-        names = ("qpos", "qvel", "act") if model.na else ("qpos", "qvel")
+        names = tuple(name for name in (*states, WARMSTART) if name != "act" or model.na)
+        states = {**states, WARMSTART: np.zeros((len(states["qpos"]), model.nv))}
         step = jax.vmap(compile_step(model, inputs=(*names, "ctrl"), outputs=names, physics=physics))
 
-        def play(_, given):
-            state, ctrl = given
+        def play(state, ctrl):
             return jax.lax.scan(lambda s, _: (step(*s, ctrl), None), state, length=num_steps)[0]
 
         self.state = tuple(jnp.asarray(states[name], jnp.float32) for name in names)
         self.size = len(states["qpos"]) * num_steps
         number = len(jax.devices()) if physics == "scalar" else 1  # C MuJoCo uses all cores by itself
-        divided = jax.jit(map_in_parts(play, number, jax.devices()[:number]))
+        divided = divide_batch(play, devices=jax.devices()[:number])
         ctrl = jnp.zeros((len(states["qpos"]), model.nu), jnp.float32)
         began = time.perf_counter()
-        lowered = divided.trace((), (self.state, ctrl)).lower()
+        lowered = divided.trace(self.state, ctrl).lower()
         self.trace_seconds = time.perf_counter() - began
         began = time.perf_counter()
         self.run = lowered.compile()
@@ -107,7 +122,7 @@ class Compiled:
 
     def play(self, ctrl: np.ndarray) -> tuple:
         """The states after the last step."""
-        return jax.block_until_ready(self.run((), (self.state, jnp.asarray(ctrl, jnp.float32))))
+        return jax.block_until_ready(self.run(self.state, jnp.asarray(ctrl, jnp.float32)))
 
     def measure(self, ctrl: np.ndarray) -> np.ndarray:
         return self.size * time_calls(lambda: self.play(ctrl))
@@ -166,17 +181,50 @@ def count_left(model: mujoco.MjModel, watched: list, positions: np.ndarray) -> f
     return float(np.mean(np.asarray(flags)))
 
 
+def find_peak() -> float:
+    """The largest resident memory of this process so far [MiB]; NaN where the system does not say."""
+    lines = STATUS.read_text().splitlines() if STATUS.exists() else []
+    return next((int(line.split()[1]) / 1024 for line in lines if line.startswith("VmHWM:")), float("nan"))
+
+
+def divide_cpu() -> None:
+    """A device for each core; a process that has used its devices keeps them."""
+    with contextlib.suppress(RuntimeError):
+        jax.config.update("jax_num_cpu_devices", CORES)
+
+
+def compile_alone(path: Path, num_envs: int, num_steps: int) -> list[float]:
+    """Largest memory of a new process before and after it has traced and compiled the model's loop [MiB]."""
+    divide_cpu()
+    model = load(path)
+    states, before = make_states(model, num_envs), find_peak()
+    Compiled(model, states, num_steps, "scalar")
+    return [before, find_peak()]
+
+
+def measure_memory(path: Path, options) -> list[float]:
+    """`compile_alone` in a process of its own."""
+    with multiprocessing.get_context("spawn").Pool(1) as pool:
+        return pool.apply(compile_alone, (path, options.envs, options.steps))
+
+
 # --- one model --------------------------------------------------------------------------------------------------------
+
+
+def load(path: Path) -> mujoco.MjModel:
+    """The model of a file, without collisions of meshes."""
+    model = change_collision(compile_model(load_spec(path)), "primitives")
+    if not model.nv:
+        raise MujocoModelError("nothing moves")
+    return model
 
 
 def measure_model(path: Path, options) -> dict[str, Any]:
     """Everything about one model file; of one that cannot be stepped, what MuJoCo or we say of it."""
     name = path.stem if path.parent == ASSETS else f"{path.parent.name}/{path.stem}"
     try:
-        model = change_collision(compile_model(load_spec(path)), "primitives")
-        if not model.nv:
-            raise MujocoModelError("nothing moves")
-        return {"model": name, **measure_speeds(model, options)}
+        row = {"model": name, **measure_speeds(load(path), options)}
+        return row | ({"memory": measure_memory(path, options)} if options.memory else {})
     except MujocoModelError as error:
         return {"model": name, "error": str(error)}
 
@@ -241,6 +289,9 @@ def show(row: dict[str, Any]) -> None:
         error, larger_error = found["difference"]
         tail = f"{100 * found['left_to_c']:5.1f} % {error:.0e} {larger_error:.0e}"
         print(f"{head} {kind:5} {rates}  {ratios}  {found['floor_over_C'][1]:5.2f} {tail}", flush=True)
+    if "memory" in row:
+        before, after = row["memory"]
+        print(f"    largest memory of a process that compiles it: {before:.0f} MiB before, {after:.0f} MiB after")
     if row["reason"]:
         print(f"    stepped by C MuJoCo: {row['reason'][:140]}", flush=True)
 
@@ -262,10 +313,10 @@ def main(arguments: Sequence[str]) -> None:
     parser.add_argument("--envs", type=count, default=1024)
     parser.add_argument("--steps", type=count, default=50)
     parser.add_argument("--rounds", type=count, default=5)
+    parser.add_argument("--memory", action="store_true", help="memory of tracing and compiling each model")
     options = parser.parse_args(arguments)
     files = list_files(options.files)
-    with contextlib.suppress(RuntimeError):  # a process that has used its devices keeps them
-        jax.config.update("jax_num_cpu_devices", CORES)
+    divide_cpu()
     print(
         "model, equations, points of contact, watched pairs, s to trace, to compile, bytes/env, controls, "
         f"M steps/s: {', '.join(METHODS)}; ours over C (range), for each core's second, floor over "
