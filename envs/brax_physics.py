@@ -40,7 +40,7 @@ def replace_physics(env: Any, physics: str) -> Any:
     """
     model = copy_model(env.sys)
     state = ("qpos", "qvel", "qacc_warmstart")
-    place = compile_forward(model, outputs=FIELDS, physics=physics)
+    place = compile_forward(model, inputs=("qpos", "qvel"), outputs=FIELDS, physics=physics)
     advance = compile_step(model, env._n_frames, inputs=(*state, "ctrl"), outputs=(*state, *FIELDS), physics=physics)
 
     def init(q, qd, act=None, ctrl=None):

@@ -20,10 +20,12 @@ import mujoco
 
 from envs.options import OptionError
 from envs.physics import compile_forward, compile_step
-from envs.physics.fields import INPUTS, OUTPUTS, STATE, find_types
+from envs.physics.fields import ADDED, INPUTS, STATE, find_types
+from envs.physics.fields import OUTPUTS as ALL_OUTPUTS
 from envs.physics.forward import normalize_quaternions
 from envs.physics.models import import_mjx
 
+OUTPUTS = tuple(name for name in ALL_OUTPUTS if name not in ADDED)  # those that mjx.Data has too
 ALWAYS = ("qpos", "qvel", "act", "ctrl", "qacc_warmstart")
 _tracing = threading.RLock()  # held while the names stand for other functions
 

@@ -254,7 +254,7 @@ def test_brax_environments_train(command, tmp_path, backend):
 def test_a_policy_is_played_with_the_threads_of_a_training(monkeypatch, uninterrupted):
     """Brax's environments hang on more than one with some releases of jaxlib, in an evaluation as in a training."""
     prepared = []
-    monkeypatch.setattr(policies, "prepare", prepared.append)
+    monkeypatch.setattr(policies, "prepare", lambda config, **_: prepared.append(config))
     stored = policies.load(str(uninterrupted[0]))
     (config,) = prepared
     assert config.choices == stored.config.choices

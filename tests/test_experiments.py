@@ -134,7 +134,7 @@ def test_reinforce_and_td(experiments, monkeypatch):
     assert (experiments / "reinforce_and_td.png").read_bytes().startswith(b"\x89PNG")
 
 
-CLAW = """<mujoco><default><geom type="capsule" fromto="0 0 0 .3 0 0" size=".02"/></default><worldbody>
+CLAW = """<mujoco><default><geom type="capsule" fromto="0 0 0 .3 0 0" size=".02" condim="6"/></default><worldbody>
 <body><joint name="a" axis="0 1 0"/><geom/></body><body pos="0 0 {}"><joint axis="0 1 0"/><geom/></body></worldbody>
 <option gravity="0 0 0"/><actuator><motor joint="a" ctrlrange="-1 1"/></actuator></mujoco>"""
 

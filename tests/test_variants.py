@@ -9,8 +9,8 @@ import jax.numpy as jnp
 import models
 import mujoco
 import numpy as np
+import published
 import pytest
-import robots
 import test_constraints
 from constrained import converge
 
@@ -93,7 +93,7 @@ DERIVING = {
     "pendulum": lambda: envs.make("pendulum").model,
     "slides": lambda: mujoco.MjModel.from_xml_string(SLIDES),
     "Panda": lambda: models.panda(limits=True),
-    "UR5e": lambda: robots.load("universal_robots_ur5e/ur5e.xml"),
+    "UR5e": lambda: published.load("universal_robots_ur5e/ur5e.xml"),
     "everything": lambda: mujoco.MjModel.from_xml_string(dynamics.write_mjcf(extra=dynamics.TENDONS + EQUALITIES)),
 }
 # What a step does not depend on, but for the acceleration of muscles.

@@ -69,6 +69,7 @@ def trace_step(
     return _check_size(trace(single_with_flag, *example, jnp.zeros(())) if watched else trace(single, *example))
 
 
+@jax.ensure_compile_time_eval()  # also where a caller is traced
 def trace_fields(
     model: mujoco.MjModel,
     inputs: tuple[str, ...],
