@@ -125,6 +125,7 @@ def test_only_mujocos_physics_is_chosen():
         envs.make("brax", name="reacher", backend="spring", physics="mujoco")
 
 
+@pytest.mark.filterwarnings("ignore:JAXopt:DeprecationWarning")  # brax imports it
 def test_the_swimmer_is_refused_for_as_long_as_it_does_not_run():
     with pytest.raises(OptionError, match=r"^env.name=swimmer: brax's does not run with jax 0.10 or newer$"):
         envs.make("brax", name="swimmer")
