@@ -69,7 +69,6 @@ def trace_step(
     return _check_size(trace(single_with_flag, *example, jnp.zeros(())) if watched else trace(single, *example))
 
 
-@jax.ensure_compile_time_eval()  # also where a caller is traced
 def trace_fields(
     model: mujoco.MjModel,
     inputs: tuple[str, ...],
@@ -94,12 +93,11 @@ def trace_fields(
     """
     fields, flags = list_fields(outputs), []
     if set(fields) <= set(KINEMATICS):
-        single, example = make_single_step(
-            put_model(model),
-            inputs,
-            find_outputs(model, outputs),
-            lambda mx, d: find_kinematics(model, mx, extend(model, d), fields),
-        )
+
+        def place(mx, d):
+            return find_kinematics(model, mx, extend(model, d), fields)
+
+        single, example = _make_single(model, inputs, outputs, place)
         return _check_size(trace(single, *example))
     _check_features(model, outputs)
     is_solved = _needs_solution(model, outputs)
