@@ -9,7 +9,7 @@ import numpy as np
 import published
 import pytest
 
-from envs.physics import MujocoModelError, check_model, compile_step, describe, step
+from envs.physics import MujocoModelError, check_model, compile_step, describe, scalar
 from envs.physics.collision import change_collision, describe_meshes, list_colliding_meshes, measure_fit
 from envs.physics.features import unsupported_features
 from envs.physics.models import import_mjx, put_model
@@ -102,7 +102,7 @@ def test_published_robots_have_no_such_feature(name):
 
 def test_a_model_with_such_a_feature_moves_as_in_mujoco(caplog, monkeypatch):
     """Whereas MJX would leave the delay of the actuator out."""
-    monkeypatch.setattr(step, "_warned", set())
+    monkeypatch.setattr(scalar, "_warned", set())
     model = mujoco.MjModel.from_xml_string(models.chain(models.pole(), DELAYED))
     state = np.full(1, 0.3), np.ones(1), np.ones(1)
     with caplog.at_level(logging.WARNING):
@@ -262,7 +262,7 @@ def test_fitted_shapes_enclose_the_meshes():
 
 
 def test_left_out_collision_is_said_once(caplog, monkeypatch):
-    monkeypatch.setattr(step, "_warned", set())
+    monkeypatch.setattr(scalar, "_warned", set())
     model = meshes()
     state = [np.asarray(x) for x in (model.qpos0, np.zeros(model.nv), np.zeros(0))]
     with caplog.at_level(logging.WARNING):

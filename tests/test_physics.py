@@ -22,8 +22,8 @@ from envs.physics import (
     ignored_features,
     load_model,
     load_spec,
+    scalar,
 )
-from envs.physics import step as physics_step
 
 STATE = ("qpos", "qvel")
 
@@ -205,7 +205,7 @@ def test_what_has_no_equations_is_stepped_by_c_mujoco(caplog, monkeypatch):
         models.chain(models.LIMITED, '<motor joint="slide" delay="0.01" nsample="5"/>')
     )
     states = models.random_states(model, 20)
-    monkeypatch.setattr(physics_step, "_warned", set())
+    monkeypatch.setattr(scalar, "_warned", set())
     with caplog.at_level(logging.WARNING), jax.enable_x64(True):
         step = compile_step(model)
         compile_step(model)

@@ -10,7 +10,7 @@ import pytest
 from test_scalarize import CASES
 
 import envs
-from envs.physics import step
+from envs.physics import scalar, step
 from envs.physics.dynamics.program import trace_step
 from envs.physics.interpreter import trace
 from envs.physics.storage import from_text, make_name, to_text, use_store
@@ -38,7 +38,7 @@ def made(monkeypatch):
         return trace_step(model, *ends)
 
     monkeypatch.setattr("envs.physics.dynamics.program.trace_step", counted)
-    monkeypatch.setattr(step, "_latest", Forgetful())
+    monkeypatch.setattr(scalar, "_latest", Forgetful())
     return models
 
 

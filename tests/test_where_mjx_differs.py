@@ -10,8 +10,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from envs.physics import MujocoModelError, compile_step
-from envs.physics import step as physics_step
+from envs.physics import MujocoModelError, compile_step, scalar
 
 PAGE = (Path(__file__).parent.parent / "docs" / "physics.md").read_text(encoding="utf-8")
 LINK = '<geom type="capsule" fromto="0 0 0 .5 0 0" size=".03" mass="1" contype="0" conaffinity="0"/>'
@@ -109,7 +108,7 @@ def find_difference(ours, true):
 @pytest.mark.parametrize(("text", "velocity", "control", "steps"), CASES)
 def test_scalar_is_mujocos_and_mjx_is_not(text, velocity, control, steps, monkeypatch, caplog):
     """After some steps: C MuJoCo's to 1e-8; MJX refuses, or is off by more than 1e-4."""
-    monkeypatch.setattr(physics_step, "_warned", set())
+    monkeypatch.setattr(scalar, "_warned", set())
     model = mujoco.MjModel.from_xml_string(text)
     true = play_in_c(model, velocity, control, steps)
     with jax.enable_x64(True), caplog.at_level(logging.ERROR):

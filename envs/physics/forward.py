@@ -7,6 +7,7 @@ from qpos to site_xpos, the kinematics of that site.
 
 from __future__ import annotations
 
+import functools
 from typing import TYPE_CHECKING
 
 import jax
@@ -14,7 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from envs.physics.callback import make_callback_fields
-from envs.physics.collision import change_collision, describe_meshes
+from envs.physics.collision import change_collision
 from envs.physics.fields import (
     INPUTS,
     INVERSE,
@@ -25,12 +26,9 @@ from envs.physics.fields import (
     list_fields,
 )
 from envs.physics.interpreter import Program
-from envs.physics.models import MujocoModelError
-from envs.physics.primitives import UnsupportedPrimitiveError
+from envs.physics.scalar import StepFn, make_scalar_function, remember
 from envs.physics.stages import Stage
-from envs.physics.step import StepFn, describe_floor, remember, warn_once
 from envs.physics.storage import make_name
-from envs.physics.tiles import make_tiled
 
 if TYPE_CHECKING:
     import mujoco
@@ -131,29 +129,14 @@ def _compile(model, inputs, outputs, physics: str, collision: str | None, invers
 
 def _make_scalar_fields(model: mujoco.MjModel, inputs: tuple[str, ...], outputs: tuple[str, ...], inverse: bool):
     """The fields as scalar equations, or for a model without this form by C MuJoCo, with a warning."""
-    colliding = change_collision(model, "primitives")
-    try:
-        program = _make_program(colliding, inputs, outputs, inverse)
-    except (UnsupportedPrimitiveError, MujocoModelError) as error:
-        warn_once(model, describe_floor(model, error))
-        return make_callback_fields(model, inputs, outputs, inverse)
-    if not set(list_fields(outputs)) <= set(KINEMATICS) and (meshes := describe_meshes(model)):
-        warn_once(model, meshes)
 
     def make_function(program: Program, stages: list[Stage]):
         return lambda *arrays: tuple(program.join(program.run(program.split(arrays), stages)))
 
-    def differentiable(*arrays):
-        derived = _make_program(colliding, inputs, outputs, inverse, differentiable=True)
-        return make_function(derived, derived.stages)(*arrays)
-
-    is_watching = len(program.outputs) > len(outputs)
-    return make_tiled(
-        program,
-        lambda stages: make_function(program, stages),
-        differentiable=differentiable,
-        replace=make_callback_fields(colliding, inputs, outputs, inverse, masked=True) if is_watching else None,
-    )
+    make_program = functools.partial(_make_program, inputs=inputs, outputs=outputs, inverse=inverse)
+    make_floor = functools.partial(make_callback_fields, inputs=inputs, outputs=outputs, inverse=inverse)
+    reads_contacts = not set(list_fields(outputs)) <= set(KINEMATICS)
+    return make_scalar_function(model, len(outputs), make_program, make_function, make_floor, reads_contacts)
 
 
 def _make_program(model, inputs, outputs, inverse: bool, differentiable: bool = False) -> Program:

@@ -9,7 +9,6 @@ for batches.
 from __future__ import annotations
 
 import functools
-import logging
 from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING
 
@@ -17,7 +16,7 @@ import jax
 import jax.numpy as jnp
 
 from envs.physics.callback import make_callback_step
-from envs.physics.collision import change_collision, describe_meshes
+from envs.physics.collision import change_collision
 from envs.physics.fields import (
     ADDED,
     FLAG,
@@ -30,24 +29,17 @@ from envs.physics.fields import (
     make_single_step,
 )
 from envs.physics.interpreter import Program
-from envs.physics.models import MujocoModelError, import_mjx, model_digest, model_name, put_whole_model
+from envs.physics.models import MujocoModelError, import_mjx, put_whole_model
 from envs.physics.pairs import has_constraints
 from envs.physics.primitives import UnsupportedPrimitiveError
+from envs.physics.scalar import StepFn, describe_reason, make_scalar_function, remember
 from envs.physics.stages import Stage
-from envs.physics.storage import load_or_make, make_name
-from envs.physics.tiles import make_tiled
+from envs.physics.storage import make_name
 
 if TYPE_CHECKING:
     import mujoco
 
-logger = logging.getLogger(__name__)
-
 WARMSTART = "qacc_warmstart"
-
-StepFn = Callable[..., tuple[jax.Array, ...]]
-
-_latest: dict[str, Program] = {}  # the last program made, by its name: a check and its step need the same one
-_warned: set[bytes] = set()  # digests of the models that `warn_once` has warned about
 
 
 def compile_step(
@@ -114,30 +106,13 @@ def make_scalar_step(
       model, num_substeps, inputs: as in `compile_step`.
       outputs: the inputs that a step changes, in their order, followed by other outputs.
     """
-    colliding = change_collision(model, "primitives")
-    hidden = _find_hidden(colliding, inputs, outputs) if num_substeps > 1 else ()
+    hidden = _find_hidden(change_collision(model, "primitives"), inputs, outputs) if num_substeps > 1 else ()
     if hidden:
         return _make_continued_step(model, num_substeps, inputs, outputs, hidden)
-    try:
-        program = make_scalar_program(colliding, inputs, outputs)
-    except (UnsupportedPrimitiveError, MujocoModelError) as error:
-        warn_once(model, describe_floor(model, error))
-        return make_callback_step(model, num_substeps, inputs, outputs)
-    if meshes := describe_meshes(model):
-        warn_once(model, meshes)
+    make_program = functools.partial(make_scalar_program, inputs=inputs, outputs=outputs)
     make_function = functools.partial(_make_program_step, inputs, num_substeps)
-
-    def differentiable(*arrays):
-        derived = make_scalar_program(colliding, inputs, outputs, differentiable=True)
-        return make_function(derived, derived.stages)(*arrays)
-
-    is_watching = len(program.outputs) > len(outputs)
-    return make_tiled(
-        program,
-        functools.partial(make_function, program),
-        differentiable=differentiable,
-        replace=make_callback_step(colliding, num_substeps, inputs, outputs, masked=True) if is_watching else None,
-    )
+    make_floor = functools.partial(make_callback_step, num_substeps=num_substeps, inputs=inputs, outputs=outputs)
+    return make_scalar_function(model, len(outputs), make_program, make_function, make_floor)
 
 
 def _find_hidden(model: mujoco.MjModel, inputs: tuple[str, ...], outputs: tuple[str, ...]) -> tuple[str, ...]:
@@ -197,12 +172,8 @@ def find_reason(model: mujoco.MjModel, inputs: tuple[str, ...], outputs: tuple[s
     try:
         make_scalar_program(model, inputs, _order_results(inputs, outputs))
     except (UnsupportedPrimitiveError, MujocoModelError) as error:
-        return _describe_reason(model, error)
+        return describe_reason(model, error)
     return ""
-
-
-def _describe_reason(model: mujoco.MjModel, error: Exception) -> str:
-    return str(error).removeprefix(f"{model_name(model)}: ")
 
 
 def count_equations(model: mujoco.MjModel, inputs: tuple[str, ...], outputs: tuple[str, ...]) -> int:
@@ -236,31 +207,6 @@ def make_scalar_program(
         return trace_step(model, inputs, outputs, differentiable)
 
     return remember(make_name(model, inputs, outputs, differentiable), make)
-
-
-def remember(name: str, make: Callable[[], Program]) -> Program:
-    """The program with this name: the last one, or from the store, or else from `make`."""
-    if name not in _latest:
-        program = load_or_make(name, make)
-        _latest.clear()
-        _latest[name] = program
-    return _latest[name]
-
-
-def describe_floor(model: mujoco.MjModel, error: Exception) -> str:
-    """Why C MuJoCo steps the model."""
-    return (
-        "it has no form as scalar equations and is stepped by C MuJoCo, at its speed and without gradients, because "
-        f"of: {_describe_reason(model, error)}. See docs/physics.md"
-    )
-
-
-def warn_once(model: mujoco.MjModel, line: str) -> None:
-    """Logs a line about how the model is stepped, once for each model in this process."""
-    digest = model_digest(model)
-    if digest not in _warned:
-        _warned.add(digest)
-        logger.warning("%s: %s", model_name(model), line)
 
 
 def _make_program_step(inputs, num_substeps: int, program: Program, stages: list[Stage]) -> Callable:
