@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from jax import lax
 
-from envs.physics import stages, tiles
+from envs.physics import kernels, stages, tiles
 from envs.physics.interpreter import trace
 from envs.physics.loops import find_loop, is_result
 from envs.physics.stages import find_loops
@@ -283,7 +283,7 @@ def test_a_loop_is_compiled_whole(solver):
 def test_a_loop_around_several_parts(solver, monkeypatch):
     """A loop that is too large for one kernel has kernels in it."""
     whole = jax.jit(jax.vmap(step_of(solver)))(*problems(200))
-    monkeypatch.setattr(stages, "KERNEL", 150)
+    monkeypatch.setattr(kernels, "KERNEL", 150)
     step = step_of(solver)
     assert len(list_kernels(step, *problems(TILE))) > 3
     agree(jax.jit(jax.vmap(step))(*problems(200)), whole, 1e-5)

@@ -8,8 +8,8 @@ import models
 import numpy as np
 import pytest
 
-from envs.physics import compile_step, stages, tiles
-from envs.physics.stages import make_kernel
+from envs.physics import compile_step, kernels, tiles
+from envs.physics.kernels import make_kernel
 from envs.physics.tiles import LANES, TILE, mujoco_step
 
 MODEL = models.make("double pendulum")
@@ -138,10 +138,12 @@ def test_derivatives(tiled, plain, transform, inside):
 
 
 def test_several_kernels(plain, monkeypatch):
-    monkeypatch.setattr(stages, "KERNEL", 10)
+    monkeypatch.setattr(kernels, "KERNEL", 10)
     step = compile_step(MODEL)
     agree(jax.jit(jax.vmap(step))(*states(300)), jax.jit(jax.vmap(plain))(*states(300)))
-    assert len(kernels(step, 100)) >= 3  # of one tile; a loop over tiles jax 0.12 makes one kernel of, with all in it
+    assert (
+        len(find_kernels(step, 100)) >= 3
+    )  # of one tile; a loop over tiles jax 0.12 makes one kernel of, with all in it
 
 
 @pytest.mark.parametrize(
@@ -174,7 +176,7 @@ def test_a_kernel_uses_all_that_it_is_given():
     assert f"func.func private @{outer[0]}(%arg0: tensor<4xf32>, %arg1: tensor<4x3xf32>)" in text
 
 
-def kernels(step, size):
+def find_kernels(step, size):
     compiled = jax.jit(jax.vmap(step)).lower(*states(size)).compile()
     return set(re.findall(rb"[\w.]+_kernel\b", compiled.runtime_executable().serialize()))
 
@@ -186,8 +188,8 @@ def test_a_tile_is_compiled_whole(tiled, plain, size):
 
     The kernel's name is read from the compiled program, which jax gives no promise about.
     """
-    assert len(kernels(tiled, size)) == 1
-    assert not kernels(plain, size)
+    assert len(find_kernels(tiled, size)) == 1
+    assert not find_kernels(plain, size)
 
 
 def test_precision_is_that_of_the_tracing():

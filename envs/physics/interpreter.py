@@ -22,6 +22,7 @@ import numpy as np
 
 from envs.physics.arrays import as_objects, choose_array, is_numeric, pack, promote, simplify_dtype
 from envs.physics.expressions import Expression, Graph
+from envs.physics.kernels import join_into_kernels
 from envs.physics.loops import trace_loop
 from envs.physics.primitives import UnsupportedPrimitiveError, choose
 from envs.physics.rules import RULES
@@ -29,7 +30,6 @@ from envs.physics.stages import (
     Stage,
     compile_separately,
     count_equations,
-    join_into_kernels,
     make_stages,
     read,
     run,

@@ -51,9 +51,6 @@ LARGEST = 48
 # These are stored even if they are used once. With 1,024 environments XLA splits a loop of a sine and a few other
 # operations between two threads, which takes three times as long as two loops on one thread.
 STORED = ("sin", "cos")
-# Equations per kernel. Compile time grows faster than this number, and kernels are compiled in parallel; a seven-joint
-# arm runs a seventh slower in three kernels than in one.
-KERNEL = 3000
 MOST_ROUNDS = 2**30  # of a loop: more than there ever are
 
 
@@ -95,7 +92,7 @@ def make_stages(outputs: Iterable[Expression]) -> list[Stage]:
     return [
         _make_stage(groups[level, loop], depth)
         if loop is None
-        else _make_loop(groups[level, loop], make_stages(_select_following(loop)))
+        else make_loop(groups[level, loop], make_stages(select_following(loop)))
         for level, loop in sorted(groups, key=lambda key: key[0])
     ]
 
@@ -170,7 +167,7 @@ def _make_stage(outputs: list[Expression], stored: dict[int, int]) -> Stage:
     return Stage(equations, inputs, outputs, compile_separately(compute))
 
 
-def _select_following(loop: Loop) -> list[Expression]:
+def select_following(loop: Loop) -> list[Expression]:
     """The values after a round; an environment that is done keeps its values while others of its batch go on."""
     goes_on = loop.carried[0]
     return [
@@ -178,7 +175,7 @@ def _select_following(loop: Loop) -> list[Expression]:
     ]
 
 
-def _make_loop(results: list[Expression], body: list[Stage]) -> Stage:
+def make_loop(results: list[Expression], body: list[Stage]) -> Stage:
     """A stage of results of one loop, with these stages of its rounds."""
     loop, _ = find_loop(results[0])
     operands = results[0].args
@@ -202,7 +199,7 @@ def _repeat(loop: Loop, body: list[Stage], operands: list[jax.Array]) -> tuple[j
     num_carried = len(loop.carried)
     captured = dict(zip((x.index for x in loop.captured), operands[num_carried:], strict=True))
     dtypes = [x.dtype for x in loop.carried]
-    following, batch = _select_following(loop), operands[0].shape
+    following, batch = select_following(loop), operands[0].shape
 
     def advance(state):
         count, *carry = state
@@ -240,66 +237,6 @@ def compile_separately(function: Callable, **attributes: str) -> Callable:
             return compiled(*values)
 
     return call
-
-
-def make_kernel(function: Callable) -> Callable:
-    """Makes XLA's CPU compiler turn a function into one kernel, instead of one for every loop in it.
-
-    XLA itself marks the calls of small loops so; here the mark is set explicitly. The compiler ends the process if a
-    marked call does not use all its operands after simplification. Hence the call inside the call, whose operands stay,
-    and the barrier, which stops constants.
-    """
-    call = compile_separately(compile_separately(function), xla_cpu_small_call="true")
-
-    def kernel(*arrays):
-        return call(*lax.optimization_barrier(arrays))
-
-    return kernel
-
-
-def join_into_kernels(stages: list[Stage], outputs: Iterable[Expression]) -> list[Stage]:
-    """Joins consecutive stages into kernels: large, so that there are few, but small enough to compile fast."""
-    groups: list[list[Stage]] = []
-    room = 0
-    for stage in stages:
-        if room < stage.size:
-            groups.append([])
-            room = KERNEL
-        groups[-1].append(stage)
-        room -= stage.size
-    used = {x.index for x in outputs}
-    kernels = []
-    for group in reversed(groups):
-        kernel = _split_loop(group[0]) if len(group) == 1 and is_large_loop(group[0]) else _join(group, used)
-        used |= {x.index for x in kernel.inputs}
-        kernels.append(kernel)
-    return kernels[::-1]
-
-
-def is_large_loop(stage: Stage) -> bool:
-    """Whether the stage is a loop that is too large for one kernel."""
-    return bool(stage.body) and stage.size > KERNEL
-
-
-def _split_loop(stage: Stage) -> Stage:
-    """A loop around kernels, for one that is too large for a kernel."""
-    loop, _ = find_loop(stage.outputs[0])
-    return _make_loop(stage.outputs, join_into_kernels(list(stage.body), _select_following(loop)))
-
-
-def _join(group: list[Stage], used: set[int]) -> Stage:
-    """Joins stages into one that stores only the values used outside it."""
-    computed = {x.index: x for stage in group for x in stage.outputs}
-    given = {x.index: x for stage in group for x in stage.inputs if x.index not in computed}
-    outputs = [x for index, x in computed.items() if index in used]
-
-    def compute(*values):
-        known = dict(zip(given, values, strict=True))
-        run(group, known)
-        return [known[x.index] for x in outputs]
-
-    equations = [x for stage in group for x in stage.equations]
-    return Stage(equations, list(given.values()), outputs, make_kernel(compute))
 
 
 def run(stages: list[Stage], values: dict[int, Any]) -> None:

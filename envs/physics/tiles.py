@@ -22,7 +22,8 @@ from jax.interpreters import ad, batching, mlir
 
 from envs.batches import LANES
 from envs.physics.interpreter import Program
-from envs.physics.stages import Stage, is_large_loop, make_kernel
+from envs.physics.kernels import is_large_loop, make_kernel
+from envs.physics.stages import Stage
 
 # Environments per tile. In smaller tiles the loops are too short; from 256 on XLA splits large loops between threads,
 # which is impossible inside a kernel.
