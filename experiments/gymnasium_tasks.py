@@ -20,9 +20,7 @@ Prints one table and writes results/gymnasium_tasks.json: medians of the rounds 
 
 from __future__ import annotations
 
-import contextlib
 import json
-import os
 import subprocess
 import time
 from collections.abc import Sequence
@@ -35,9 +33,9 @@ import jax.numpy as jnp
 import numpy as np
 from commands import Parser, count, write_json
 from flax import struct
+from measuring import CORES, compile_in_parts, count_parts, divide_cpu, summarise, time_calls
 
 from envs.base import MjxEnv, State, initial_state
-from envs.batches import LANES, divide_batch
 from envs.options import describe_unknown
 from envs.physics import load_spec
 from jaxpg.commands.ending import run_command
@@ -46,7 +44,6 @@ from jaxpg.vector_env import vectorize
 
 ASSETS = Path(find_spec("gymnasium").origin).parent / "envs" / "mujoco" / "assets"
 PEER = Path(__file__).parent / "peers" / "envpool_steps.py"
-CORES = len(os.sched_getaffinity(0))
 STEPS = 50  # of one call
 SECONDS = 2.0  # that one measurement lasts, at least
 
@@ -219,7 +216,7 @@ class Ours:
     """All environments of a task on all cores; each call of `play` goes on where the last one ended."""
 
     def __init__(self, name: str, num_envs: int):
-        number = CORES if len(jax.devices()) >= CORES and num_envs % (LANES * CORES) == 0 else 1
+        number = count_parts(num_envs)
         vector = vectorize(TASKS[name](), num_envs // number, LENGTHS.get(name, 1000))
 
         def reset(keys):
@@ -235,17 +232,13 @@ class Ours:
             state, rewards = jax.lax.scan(step, state, given)
             return state, jnp.broadcast_to(jnp.mean(rewards), keys.shape)
 
-        def divide(function, in_axes=0):
-            if number == 1:
-                return jax.jit(function)
-            return divide_batch(function, in_axes, jax.devices()[:number])
-
         size = (STEPS, num_envs, vector.action_size)
         self.size, self.keys = num_envs * STEPS, jax.random.split(jax.random.key(0), num_envs)
         self.actions = jax.random.uniform(jax.random.key(1), size, minval=-1.0)
-        self.state = divide(reset)(self.keys)
+        self.state = compile_in_parts(reset, number)(self.keys)
         began = time.perf_counter()
-        self.run = divide(play, (None, 0, 0)).lower(self.actions, self.state, self.keys).compile()
+        divided = compile_in_parts(play, number, (None, 0, 0))
+        self.run = divided.lower(self.actions, self.state, self.keys).compile()
         self.seconds = time.perf_counter() - began
 
     def play(self) -> float:
@@ -256,11 +249,7 @@ class Ours:
 
     def measure(self) -> float:
         """Environment steps per second."""
-        began, number = time.perf_counter(), 0
-        while number == 0 or time.perf_counter() - began < SECONDS:
-            self.play()
-            number += 1
-        return number * self.size / (time.perf_counter() - began)
+        return self.size * time_calls(self.play, SECONDS)[0]
 
 
 class InEnvPool:
@@ -300,10 +289,6 @@ def measure_task(name: str, options) -> dict[str, Any]:
     return row
 
 
-def summarise(values: np.ndarray) -> tuple[float, float, float]:
-    return float(values.min()), float(np.median(values)), float(values.max())
-
-
 def show(row: dict[str, Any]) -> None:
     print(f"{row['task']:15} {row['seconds']:6.1f} {row['reward']:7.3f} {row['ours'][1]:12,.0f}", end="")
     if "ratio" in row:
@@ -323,8 +308,7 @@ def main(arguments: Sequence[str]) -> None:
     for name in tasks:
         if name not in TASKS:
             parser.error(describe_unknown("task", name, TASKS))
-    with contextlib.suppress(RuntimeError):  # a process that has used its devices keeps them
-        jax.config.update("jax_num_cpu_devices", CORES)
+    divide_cpu()
     print("task, s to compile, mean reward, environment steps/s: ours, EnvPool; ours over EnvPool (range)")
     rows = []
     for name in tasks:

@@ -34,10 +34,12 @@ import mujoco
 import mujoco.rollout
 import numpy as np
 from commands import Parser, count, write_json
-from robots import CORES, list_files, load, make_controls, make_states
+from measuring import CORES
+from robots import list_files, load, make_controls, make_states
 
 from envs.base import ASSETS
 from envs.physics import MujocoModelError, compile_step, describe
+from envs.physics.models import find_control_ranges
 from jaxpg.commands.ending import run_command
 
 QUICK = {"xla_backend_optimization_level": 0}
@@ -162,8 +164,7 @@ def load_system(source: str | Path) -> mujoco.MjModel:
 def swing(model: mujoco.MjModel, num_envs: int, num_steps: int) -> np.ndarray:
     """Controls that go through the range of each actuator slowly, with other periods for each."""
     periods = np.random.default_rng(2).uniform(500, 3000, (num_envs, 1, model.nu))
-    limited = model.actuator_ctrllimited.astype(bool)[:, None]
-    low, high = np.where(limited, model.actuator_ctrlrange, [-1.0, 1.0]).T
+    low, high = find_control_ranges(model)
     wave = np.sin(2 * np.pi * np.arange(num_steps)[None, :, None] / periods)
     return (low + high) / 2 + (high - low) / 2 * wave
 

@@ -19,8 +19,6 @@ Prints one table and writes results/mujoco_environments.json: medians of the rou
 
 from __future__ import annotations
 
-import contextlib
-import os
 import time
 from collections.abc import Sequence
 from importlib.util import find_spec
@@ -30,14 +28,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from commands import Parser, count, write_json
+from measuring import compile_in_parts, count_parts, divide_cpu, summarise, time_calls
 
 import envs
-from envs.batches import LANES, divide_batch
 from envs.options import OptionError
 from jaxpg.commands.ending import run_command
 from jaxpg.vector_env import vectorize
 
-CORES = len(os.sched_getaffinity(0))
 PHYSICS = ("scalar", "mujoco", "mjx")
 BRAX = ("inverted_pendulum", "inverted_double_pendulum", "reacher", "hopper", "walker2d", "halfcheetah", "pusher")
 BRAX += ("ant", "humanoid", "humanoidstandup")
@@ -53,8 +50,7 @@ class Batch:
         library, own = name.split(":")
         began = time.perf_counter()
         env = envs.make(library, name=own, physics=physics)
-        is_divisible = options.envs % (LANES * CORES) == 0 and len(jax.devices()) >= CORES
-        number = CORES if physics != "mujoco" and is_divisible else 1
+        number = count_parts(options.envs) if physics != "mujoco" else 1
         part = options.envs // number
         vector = vectorize(env, part, LENGTH)
 
@@ -71,13 +67,10 @@ class Batch:
             state, rewards = jax.lax.scan(step, state, jax.random.split(keys[0], options.steps))
             return state, jnp.mean(rewards, 0)
 
-        def divide(function):
-            return jax.jit(function) if number == 1 else divide_batch(function, devices=jax.devices()[:number])
-
         self.size = options.envs * options.steps
         self.keys = jax.random.split(jax.random.key(0), options.envs)
-        self.state = divide(reset)(self.keys)
-        self.run = divide(play).lower(self.state, self.keys).compile()
+        self.state = compile_in_parts(reset, number)(self.keys)
+        self.run = compile_in_parts(play, number).lower(self.state, self.keys).compile()
         self.seconds = time.perf_counter() - began
         self.reward = float(np.mean([self.play() for _ in range(max(1, COMPARED // options.steps))]))
 
@@ -89,11 +82,7 @@ class Batch:
 
     def measure(self) -> float:
         """Environment steps per second."""
-        began, number = time.perf_counter(), 0
-        while number == 0 or time.perf_counter() - began < SECONDS:
-            self.play()
-            number += 1
-        return number * self.size / (time.perf_counter() - began)
+        return self.size * time_calls(self.play, SECONDS)[0]
 
 
 def measure_environment(name: str, options) -> dict[str, Any]:
@@ -106,10 +95,6 @@ def measure_environment(name: str, options) -> dict[str, Any]:
     if "mjx" in batches:
         row["ratio"] = summarise(rates[:, 0] / rates[:, kinds.index("mjx")])
     return row
-
-
-def summarise(values: np.ndarray) -> tuple[float, float, float]:
-    return float(values.min()), float(np.median(values)), float(values.max())
 
 
 def show(row: dict[str, Any]) -> None:
@@ -143,8 +128,7 @@ def main(arguments: Sequence[str]) -> None:
     for name in options.names:
         if name.split(":")[0] not in ("brax", "playground") or name.count(":") != 1:
             parser.error(f"{name}: expected brax:NAME or playground:NAME")
-    with contextlib.suppress(RuntimeError):  # a process that has used its devices keeps them
-        jax.config.update("jax_num_cpu_devices", CORES)
+    divide_cpu()
     kinds = ", ".join(physics for physics in PHYSICS if physics not in options.without)
     print(f"environment, environment steps/s: {kinds}; scalar over mjx (range); s to compile; mean rewards")
     rows = []

@@ -24,6 +24,7 @@ import jax.numpy as jnp
 import numpy as np
 from commands import Parser, count, write_json
 from flax import struct
+from measuring import summarise
 
 import envs
 from envs.base import ASSETS, Interface, MjxEnv, State, initial_state
@@ -179,7 +180,7 @@ def main(arguments: Sequence[str]) -> Any:
     rows = []
     print("physics, s to compile, environment steps/s of training (range)")
     for (physics, training), rate in zip(trainings.items(), rates.T, strict=True):
-        low, middle, high = rate.min(), np.median(rate), rate.max()
+        low, middle, high = summarise(rate)
         rows.append({"physics": physics, "seconds": training.seconds, "rate": [low, middle, high]})
         print(f"{physics:8} {training.seconds:6.1f} {middle:10,.0f} ({low:,.0f} to {high:,.0f})")
     write_json("panda_reach.json", rows)

@@ -26,11 +26,9 @@ Prints one table and writes results/robots.json: medians of the rounds with the 
 
 from __future__ import annotations
 
-import contextlib
 import multiprocessing
-import os
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -41,6 +39,7 @@ import mujoco.batch
 import mujoco.rollout
 import numpy as np
 from commands import Parser, count, write_json
+from measuring import CORES, divide_cpu, summarise, time_calls
 
 from envs.base import ASSETS
 from envs.physics import (
@@ -56,13 +55,12 @@ from envs.physics import (
 from envs.physics.dynamics.choice import choose_pairs, count_points
 from envs.physics.dynamics.forward import find_positions
 from envs.physics.dynamics.watch import may_touch
-from envs.physics.models import import_mjx, put_model
+from envs.physics.models import find_control_ranges, import_mjx, put_model
 from envs.physics.pairs import candidate_pairs
 from envs.physics.step import WARMSTART
 from jaxpg.commands.ending import run_command
 from jaxpg.errors import UserError
 
-CORES = len(os.sched_getaffinity(0))
 STATUS = Path("/proc/self/status")  # of a process, on Linux
 SECONDS = 0.3  # that one measurement lasts, at least
 FOLDER = "robots="
@@ -86,8 +84,7 @@ def make_states(model: mujoco.MjModel, num_envs: int) -> dict[str, np.ndarray]:
 
 def make_controls(model: mujoco.MjModel, num_envs: int, share: float) -> np.ndarray:
     """Random controls from a share of each actuator's range, around its middle or where the keyframe has it."""
-    limited = model.actuator_ctrllimited.astype(bool)[:, None]
-    low, high = np.where(limited, model.actuator_ctrlrange, [-1.0, 1.0]).T
+    low, high = find_control_ranges(model)
     middle = model.key_ctrl[0] if model.nkey and share < 1 else (low + high) / 2
     random = np.random.default_rng(1).uniform(-0.5, 0.5, (num_envs, model.nu))
     return np.clip(middle + share * (high - low) * random, low, high)
@@ -125,7 +122,7 @@ class Compiled:
         return jax.block_until_ready(self.run(self.state, jnp.asarray(ctrl, jnp.float32)))
 
     def measure(self, ctrl: np.ndarray) -> np.ndarray:
-        return self.size * time_calls(lambda: self.play(ctrl))
+        return self.size * time_calls(lambda: self.play(ctrl), SECONDS)
 
 
 class InC:
@@ -158,15 +155,6 @@ class InC:
         return self.size * np.max([time_calls(way, SECONDS / 2) for way in ways], 0)
 
 
-def time_calls(call: Callable[[], Any], seconds: float = SECONDS) -> np.ndarray:
-    """Calls per second, and per second of all cores' time, over at least so many seconds."""
-    began, began_cores, number = time.perf_counter(), time.process_time(), 0
-    while number == 0 or time.perf_counter() - began < seconds:
-        call()
-        number += 1
-    return number / np.array([time.perf_counter() - began, time.process_time() - began_cores])
-
-
 def count_left(model: mujoco.MjModel, watched: list, positions: np.ndarray) -> float:
     """The share of the positions `[..., nq]` in which a watched pair may touch."""
     mx = put_model(model)
@@ -185,12 +173,6 @@ def find_peak() -> float:
     """The largest resident memory of this process so far [MiB]; NaN where the system does not say."""
     lines = STATUS.read_text().splitlines() if STATUS.exists() else []
     return next((int(line.split()[1]) / 1024 for line in lines if line.startswith("VmHWM:")), float("nan"))
-
-
-def divide_cpu() -> None:
-    """A device for each core; a process that has used its devices keeps them."""
-    with contextlib.suppress(RuntimeError):
-        jax.config.update("jax_num_cpu_devices", CORES)
 
 
 def compile_alone(path: Path, num_envs: int, num_steps: int) -> list[float]:
@@ -270,10 +252,6 @@ def play_rounds(methods: dict[str, Any], ctrl: np.ndarray, rounds: int) -> dict[
     ours, floor = (ratios[:, list(methods).index(name)] for name in ("ours", "floor"))
     found |= {"ours_over_C": summarise(ours[:, 0]), "floor_over_C": summarise(floor[:, 0])}
     return found | {"ours_over_C_per_core": summarise(ours[:, 1])}
-
-
-def summarise(values: np.ndarray) -> tuple[float, float, float]:
-    return float(values.min()), float(np.median(values)), float(values.max())
 
 
 def show(row: dict[str, Any]) -> None:

@@ -14,7 +14,14 @@ import numpy as np
 
 from envs.physics.callback import INITIAL_COUNT, has_diverged
 from envs.physics.collision import change_collision, describe_meshes
-from envs.physics.models import compile_model, ignored_features, load_spec, model_digest, model_name
+from envs.physics.models import (
+    compile_model,
+    find_control_ranges,
+    ignored_features,
+    load_spec,
+    model_digest,
+    model_name,
+)
 from envs.physics.numeric import evaluate
 from envs.physics.step import compile_step, find_reason, make_scalar_program
 
@@ -123,8 +130,7 @@ def _list_starts(model: mujoco.MjModel) -> list[dict[str, np.ndarray]]:
 def _draw_controls(model: mujoco.MjModel, shape: tuple[int, ...]) -> np.ndarray:
     """Random controls of each actuator over its own range, or from -1 to 1; a fifth of them at one of the ends."""
     random = np.random.default_rng(1)
-    limited = model.actuator_ctrllimited.astype(bool)[:, None]
-    low, high = np.where(limited, model.actuator_ctrlrange, [-1.0, 1.0]).T
+    low, high = find_control_ranges(model)
     share = random.uniform(-0.125, 1.125, (*shape, model.nu)).clip(0, 1)
     return low + (high - low) * share
 

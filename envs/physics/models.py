@@ -92,6 +92,13 @@ def model_digest(model: mujoco.MjModel) -> bytes:
     return hashlib.sha256(content.data).digest()
 
 
+def find_control_ranges(model: mujoco.MjModel) -> tuple[np.ndarray, np.ndarray]:
+    """(lowest, highest) control of each actuator, `[nu]`; -1 and 1 for one without limits."""
+    is_limited = model.actuator_ctrllimited.astype(bool)[:, None]
+    low, high = np.where(is_limited, model.actuator_ctrlrange, [-1.0, 1.0]).T
+    return low, high
+
+
 def put_model(model: mujoco.MjModel):
     """The MJX model from which `envs.physics.dynamics` takes its numbers: for motion without constraints.
 

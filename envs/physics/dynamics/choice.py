@@ -10,7 +10,9 @@ import mujoco
 import numpy as np
 
 from envs.physics.callback import INITIAL_COUNT, has_diverged
+from envs.physics.dynamics.kinematics import find_carriers
 from envs.physics.dynamics.shapes import DEEPEST_ONLY, NUM_CONTACTS
+from envs.physics.models import find_control_ranges
 from envs.physics.pairs import Pair, get_shapes
 from envs.physics.primitives import UnsupportedPrimitiveError
 
@@ -75,20 +77,10 @@ def _find_bodies(model: mujoco.MjModel, pair: Pair) -> tuple[int, int]:
 
 def _goes_anywhere(model: mujoco.MjModel, body: int) -> bool:
     """Whether a free joint or a slide without limits moves the body."""
-    joints = np.unique(model.dof_jntid[list_dofs(model, body)])
+    joints = np.unique(model.dof_jntid[find_carriers(model)[body]])
     types, is_limited = model.jnt_type[joints], model.jnt_limited[joints].astype(bool)
     is_slide = types == mujoco.mjtJoint.mjJNT_SLIDE
     return bool(np.any((types == mujoco.mjtJoint.mjJNT_FREE) | (is_slide & ~is_limited)))
-
-
-def list_dofs(model: mujoco.MjModel, body: int) -> list[int]:
-    """The degrees of freedom that move a body."""
-    dofs = []
-    while body:
-        first = int(model.body_dofadr[body])
-        dofs += range(first, first + int(model.body_dofnum[body]))
-        body = int(model.body_parentid[body])
-    return dofs
 
 
 def _weigh(model: mujoco.MjModel, pair: Pair) -> int:
@@ -96,8 +88,8 @@ def _weigh(model: mujoco.MjModel, pair: Pair) -> int:
 
     The Hessian's part of a contact has about eight times as many equations.
     """
-    one, other = (set(list_dofs(model, body)) for body in _find_bodies(model, pair))
-    return NUM_CONTACTS[get_shapes(model, pair)] * pair.condim**2 * len(one ^ other)
+    one, other = find_carriers(model)[list(_find_bodies(model, pair))]
+    return NUM_CONTACTS[get_shapes(model, pair)] * pair.condim**2 * int((one != other).sum())
 
 
 def count_points(model: mujoco.MjModel, pairs: Sequence[Pair]) -> int:
@@ -124,7 +116,7 @@ def _list_frequent(model: mujoco.MjModel, pairs: Sequence[Pair], commanded: int,
         if key is not None:
             mujoco.mj_resetDataKeyframe(model, data, key)
         if commanded:
-            data.ctrl[:] = _draw_commands(model, random)
+            data.ctrl[:] = random.uniform(*find_control_ranges(model))
         for touching in _simulate(model, data):
             counts.update(touching)
             num_steps += 1
@@ -141,9 +133,3 @@ def _simulate(model: mujoco.MjModel, data: mujoco.MjData) -> Iterator[set[frozen
             return
         touching = data.contact.geom[np.asarray(data.contact.efc_address) >= 0]
         yield {frozenset(geoms) for geoms in touching.tolist()}
-
-
-def _draw_commands(model: mujoco.MjModel, random: np.random.Generator) -> np.ndarray:
-    """Controls over the whole range of each actuator, or between -1 and 1 where it has none."""
-    is_limited = model.actuator_ctrllimited.astype(bool)[:, None]
-    return random.uniform(*np.where(is_limited, model.actuator_ctrlrange, [-1.0, 1.0]).T)
