@@ -20,12 +20,11 @@ import mujoco
 
 from envs.options import OptionError
 from envs.physics import compile_forward, compile_step
-from envs.physics.fields import ADDED, INPUTS, STATE, find_types
-from envs.physics.fields import OUTPUTS as ALL_OUTPUTS
+from envs.physics.fields import COMPUTED, INPUTS, STATE, find_types
 from envs.physics.forward import normalize_quaternions
 from envs.physics.models import import_mjx
 
-OUTPUTS = tuple(name for name in ALL_OUTPUTS if name not in ADDED)  # those that mjx.Data has too
+FIELDS = (*INPUTS, *COMPUTED)  # of mjx.Data
 ALWAYS = ("qpos", "qvel", "act", "ctrl", "qacc_warmstart")
 _tracing = threading.RLock()  # held while the names stand for other functions
 
@@ -91,7 +90,7 @@ class Physics:
         used = find_used_fields(env)
         always = [name for name in ALWAYS if name != "act" or self.model.na]
         self.inputs = tuple(name for name in INPUTS if name in {*always, *used})
-        self.derived = tuple(name for name in OUTPUTS if name in used and name not in INPUTS)
+        self.derived = tuple(name for name in FIELDS if name in used and name not in INPUTS)
         self.carried = tuple(name for name in self.inputs if name in STATE)
         self._forward = compile_forward(self.model, inputs=self.inputs, outputs=self.derived, physics=physics)
         self._compile_step = functools.cache(self._compile_step)
@@ -145,7 +144,7 @@ def find_used_fields(env: Any) -> set[str]:
     used: set[str] = set()
 
     def make_data(model, **given):
-        return Data(make_fields(env.mj_model, OUTPUTS, given), used.add)
+        return Data(make_fields(env.mj_model, FIELDS, given), used.add)
 
     def play(key, action):
         return env.step(env.reset(key), action)
@@ -155,14 +154,14 @@ def find_used_fields(env: Any) -> set[str]:
         try:
             jax.eval_shape(play, key, action)
         except AttributeError as error:
-            if not used - set(OUTPUTS):
+            if not used - set(FIELDS):
                 raise
             raise OptionError([_describe_unknown(env, used)]) from error
-    return used & set(OUTPUTS)
+    return used & set(FIELDS)
 
 
 def _describe_unknown(env: Any, used: set[str]) -> str:
-    names = ", ".join(f"data.{name}" for name in sorted(used - set(OUTPUTS)))
+    names = ", ".join(f"data.{name}" for name in sorted(used - set(FIELDS)))
     return f"{type(env).__name__} reads {names}, which only MJX has: env.physics=mjx"
 
 
