@@ -12,7 +12,7 @@ from envs.physics.dynamics.constraints import make_rows
 from envs.physics.dynamics.contacts import find_contacts, make_contact_rows
 from envs.physics.dynamics.numbers import is_traced
 from envs.physics.dynamics.smooth import Constraints, Smooth
-from envs.physics.dynamics.solver import Constraint, minimise
+from envs.physics.dynamics.solver import Constraint, find_force, minimise
 
 if TYPE_CHECKING:
     from mujoco import mjx
@@ -41,8 +41,8 @@ def make_inverse_solver(pairs: Sequence[Pair], _: bool = False) -> Callable[...,
 
     def find_forces(model: mujoco.MjModel, mx: mjx.Model, d: mjx.Data, smooth: Smooth) -> tuple:
         groups = _find_groups(model, mx, d, smooth, pairs)
-        pulls = (group.pull(group.slope(group.apply(d.qacc) - group.reference)) for group in groups)
-        return d.qacc, -sum(pulls, jnp.zeros(model.nv))
+        pulls = (group.pull(find_force(group, d.qacc)) for group in groups)
+        return d.qacc, sum(pulls, jnp.zeros(model.nv))
 
     return find_forces
 

@@ -37,13 +37,10 @@ def find_equalities(model: mujoco.MjModel, mx: mjx.Model, d: mjx.Data, smooth: S
 
 def _make_connects(model, mx, d, smooth) -> Raw | None:
     """A point of one body stays at a point of another: the difference of the two points is 0."""
-    ids = _find_numbers(model, "CONNECT")
+    ids = find_numbers(model, "connect")
     if not ids.size:
         return None
-    one, other = (
-        _find_anchors(model, mx, d, smooth, ids, side, get_number(model, mx, "eq_data")[ids, 3 * side : 3 * side + 3])
-        for side in (0, 1)
-    )
+    one, other = (_find_anchors(model, mx, d, smooth, "connect", side) for side in (0, 1))
     return _make_rows(
         model,
         mx,
@@ -63,17 +60,12 @@ def _make_welds(model, mx, d, smooth) -> Raw | None:
     as it should be for the second one, and p that of the second. With angular velocities w1 and w2, its rate is the
     vector part of p* (w1 - w2) q1 / 2.
     """
-    ids = _find_numbers(model, "WELD")
+    ids = find_numbers(model, "weld")
     if not ids.size:
         return None
-    data = get_number(model, mx, "eq_data")[ids]
-    one, other = (
-        _find_anchors(model, mx, d, smooth, ids, side, data[:, 3 - 3 * side : 6 - 3 * side]) for side in (0, 1)
-    )
-    is_site = model.eq_objtype[ids] == mujoco.mjtObj.mjOBJ_SITE
-    wanted = jnp.where(is_site[:, None], jnp.array([1.0, 0, 0, 0]), data[:, 6:10])
-    scale = data[:, 10:11]
-    first = multiply_each(one.quaternion, wanted)
+    one, other = (_find_anchors(model, mx, d, smooth, "weld", side) for side in (0, 1))
+    scale = get_number(model, mx, "eq_data")[ids, 10:11]
+    first = turn_as_wanted(model, mx, one.quaternion)
 
     def turn(first, second, velocity):
         return jax.vmap(_turn_between)(first, second, velocity)
@@ -100,7 +92,7 @@ def _make_welds(model, mx, d, smooth) -> Raw | None:
 
 def _make_joint_equalities(model, mx, d, smooth) -> Raw | None:
     """The position of one joint is a polynomial of another's, or constant: y - y0 = p(x - x0)."""
-    ids = _find_numbers(model, "JOINT")
+    ids = find_numbers(model, "joint")
     if not ids.size:
         return None
     first, second = model.eq_obj1id[ids], model.eq_obj2id[ids]
@@ -122,7 +114,7 @@ def _make_joint_equalities(model, mx, d, smooth) -> Raw | None:
 
 def _make_tendon_equalities(model, mx, d, smooth) -> Raw | None:
     """The length of one tendon is a polynomial of another's, or constant."""
-    ids = _find_numbers(model, "TENDON")
+    ids = find_numbers(model, "tendon")
     if not ids.size:
         return None
     first, second = model.eq_obj1id[ids], model.eq_obj2id[ids]
@@ -139,9 +131,9 @@ def _make_tendon_equalities(model, mx, d, smooth) -> Raw | None:
     )
 
 
-def _find_numbers(model, kind: str) -> np.ndarray:
-    """The numbers of the equalities of a kind."""
-    return np.flatnonzero(model.eq_type == getattr(mujoco.mjtEq, f"mjEQ_{kind}"))
+def find_numbers(model: mujoco.MjModel, kind: str) -> np.ndarray:
+    """The numbers of the equalities of a kind: "connect", "weld", "joint" or "tendon"."""
+    return np.flatnonzero(model.eq_type == getattr(mujoco.mjtEq, f"mjEQ_{kind.upper()}"))
 
 
 def _make_coupling_rows(model, mx, d, ids, has_second, positions, jacobians, weights) -> Raw:
@@ -198,18 +190,41 @@ class _Anchors(NamedTuple):
     weight: jax.Array
 
 
-def _find_anchors(model, mx, d, smooth, ids, side: int, local_points) -> _Anchors:
-    """The first (0) or second (1) points of equalities: sites, or points in the frames of bodies."""
-    objects = (model.eq_obj1id, model.eq_obj2id)[side][ids]
-    is_site = model.eq_objtype[ids] == mujoco.mjtObj.mjOBJ_SITE
+def place_anchors(model: mujoco.MjModel, mx: mjx.Model, d: mjx.Data, kind: str, side: int) -> tuple:
+    """(bodies, positions, orientations) of the first (0) or second (1) points of all equalities of a kind.
+
+    They are sites, or points in the frames of bodies.
+    """
+    ids = find_numbers(model, kind)
+    objects, is_site = (model.eq_obj1id, model.eq_obj2id)[side][ids], _are_of_sites(model, ids)
     sites = np.where(is_site, objects, 0)
     bodies = np.where(is_site, model.site_bodyid[sites], objects) if model.nsite else objects
+    begin = 3 * (side if kind == "connect" else 1 - side)  # in eq_data
+    local_points = get_number(model, mx, "eq_data")[ids, begin : begin + 3]
     point = d.xpos[bodies] + rotate_each(d.xmat[bodies], local_points)
     quaternion = d.xquat[bodies]
     if is_site.any():
         turned = multiply_each(quaternion, get_number(model, mx, "site_quat")[sites])
         point = jnp.where(is_site[:, None], d.site_xpos[sites], point)
         quaternion = jnp.where(is_site[:, None], turned, quaternion)
+    return bodies, point, quaternion
+
+
+def turn_as_wanted(model: mujoco.MjModel, mx: mjx.Model, quaternion: jax.Array) -> jax.Array:
+    """The orientations of the first points of all welds as they should be for the second ones, `[n, 4]`."""
+    ids = find_numbers(model, "weld")
+    given = get_number(model, mx, "eq_data")[ids, 6:10]
+    wanted = jnp.where(_are_of_sites(model, ids)[:, None], jnp.array([1.0, 0, 0, 0]), given)
+    return multiply_each(quaternion, wanted)
+
+
+def _are_of_sites(model, ids: np.ndarray) -> np.ndarray:
+    return model.eq_objtype[ids] == mujoco.mjtObj.mjOBJ_SITE
+
+
+def _find_anchors(model, mx, d, smooth, kind: str, side: int) -> _Anchors:
+    """The points of `place_anchors`, with how they move."""
+    bodies, point, quaternion = place_anchors(model, mx, d, kind, side)
     spins, _ = find_body_velocities(smooth.tree, smooth.poses, d)
     spin_rates, accelerations = find_accelerations(smooth.tree, smooth.poses, d, np.zeros(3), None)
     lever, spin, spin_rate = point - d.xpos[bodies], spins[bodies], spin_rates[bodies]

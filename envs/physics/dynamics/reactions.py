@@ -11,27 +11,24 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-import mujoco
 import numpy as np
 
 from envs.physics.dynamics.constraints import make_rows
 from envs.physics.dynamics.contacts import find_arms, find_origin
+from envs.physics.dynamics.equalities import find_numbers, place_anchors, turn_as_wanted
 from envs.physics.dynamics.numbers import get_number
 from envs.physics.dynamics.rotations import (
-    IDENTITY,
     conjugate,
     contract,
     cross_each,
     length,
     multiply,
     normalize,
-    rotate_each,
     to_rotation_vector,
 )
 from envs.physics.dynamics.smooth import Constraints, Smooth
+from envs.physics.dynamics.solver import find_force
 from envs.physics.dynamics.tree import BALL
-
-EQUALITY = mujoco.mjtEq
 
 
 class Push(NamedTuple):
@@ -88,7 +85,7 @@ class Reactions:
         rows = self.constraints.rows
         if not rows.reference.size:
             return np.zeros(0)
-        return -rows.slope(rows.apply(self.d.qacc) - rows.reference)
+        return find_force(rows, self.d.qacc)
 
     def section(self, name: str):
         """The forces of the rows of a kind."""
@@ -114,52 +111,32 @@ class Reactions:
 
     @functools.cached_property
     def _contact_forces(self):
-        return [-rows.slope(rows.apply(self.d.qacc) - rows.reference) for _, rows in self.constraints.contacts]
+        return [find_force(rows, self.d.qacc) for _, rows in self.constraints.contacts]
 
     def _pull_points(self, kind: str):
         """Forces and torques of points that are held at points: [nbody, 3] twice."""
-        model, d = self.model, self.d
-        size = 3 if kind == "connect" else 6
-        pulls = self.section(kind).reshape(-1, size)
-        zero = np.zeros((model.nbody, 3))
+        model = self.model
+        pulls = self.section(kind).reshape(-1, 3 if kind == "connect" else 6)
+        force = torque = np.zeros((model.nbody, 3))
         if not len(pulls):
-            return zero, zero
-        ids = np.flatnonzero(model.eq_type == int(getattr(EQUALITY, f"mjEQ_{kind.upper()}")))
-        spin = jnp.zeros((len(ids), 3))
-        if kind == "weld":
-            spin = jnp.stack([self._find_weld_torque(int(i), x) for i, x in zip(ids, pulls[:, 3:], strict=True)])
-        force, torque = zero, zero
-        for side, sign in ((0, 1.0), (1, -1.0)):
-            sites, objects = model.eq_objtype[ids] == mujoco.mjtObj.mjOBJ_SITE, self._objects(side)[ids]
-            bodies = (
-                np.where(sites, model.site_bodyid[np.where(sites, objects, 0)], objects) if model.nsite else objects
-            )
-            begin = 3 * (side if kind == "connect" else 1 - side)
-            points = d.xpos[bodies] + rotate_each(d.xmat[bodies], self.number("eq_data")[ids, begin : begin + 3])
-            if sites.any():
-                points = jnp.where(sites[:, None], d.site_xpos[np.where(sites, objects, 0)], points)
+            return force, torque
+        (*first, q), (*second, p) = (place_anchors(model, self.mx, self.d, kind, side) for side in (0, 1))
+        spin = self._find_weld_torques(q, p, pulls[:, 3:]) if kind == "weld" else jnp.zeros((len(pulls), 3))
+        for (bodies, points), sign in ((first, 1.0), (second, -1.0)):
             here = (np.arange(model.nbody)[:, None] == bodies) * sign
             force = force + contract(here, pulls[:, :3])
             torque = torque + contract(here, spin + cross_each(points, pulls[:, :3]))
         return force, torque
 
-    def _objects(self, side: int) -> np.ndarray:
-        return (self.model.eq_obj1id, self.model.eq_obj2id)[side]
+    def _find_weld_torques(self, q, p, pulls):
+        """T' w for the rates T omega = vec(p* omega q) s / 2 of welds' errors: the torques vec(p w q*) s / 2."""
+        scales = self.number("eq_data")[find_numbers(self.model, "weld"), 10]
 
-    def _find_weld_torque(self, equality: int, pull):
-        """T' w for the rate T omega = vec(p* omega q) s / 2 of a weld's error: the torque vec(p w q*) s / 2."""
-        q, p = (self._find_orientation(equality, side) for side in (0, 1))
-        data = self.number("eq_data")[equality]
-        if self.model.eq_objtype[equality] != mujoco.mjtObj.mjOBJ_SITE:
-            q = multiply(q, data[6:10])
-        pure = jnp.concatenate([jnp.zeros(1), pull])
-        return 0.5 * data[10] * multiply(multiply(p, pure), conjugate(q))[1:]
+        def turn(q, p, w, scale):
+            pure = jnp.concatenate([jnp.zeros(1), w])
+            return 0.5 * scale * multiply(multiply(p, pure), conjugate(q))[1:]
 
-    def _find_orientation(self, equality: int, side: int):
-        number = int(self._objects(side)[equality])
-        if self.model.eq_objtype[equality] != mujoco.mjtObj.mjOBJ_SITE:
-            return self.d.xquat[number] if number else IDENTITY
-        return multiply(self.d.xquat[self.model.site_bodyid[number]], self.number("site_quat")[number])
+        return jax.vmap(turn)(turn_as_wanted(self.model, self.mx, q), p, pulls, scales)
 
     # --- tendons and limits -------------------------------------------------------------------------------------------
 

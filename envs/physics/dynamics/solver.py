@@ -49,6 +49,11 @@ class Constraint(Protocol):
     def stiffen(self, u: jax.Array, /) -> jax.Array: ...
 
 
+def find_force(constraint: Constraint, acceleration: jax.Array) -> jax.Array:
+    """-s'(J a - r), in the constraint's own components."""
+    return -constraint.slope(constraint.apply(acceleration) - constraint.reference)
+
+
 class _Point(NamedTuple):
     """An acceleration a with what is linear in it: M a - f, and u of every group of constraints."""
 
