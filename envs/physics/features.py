@@ -52,7 +52,7 @@ def list_smooth_features(model: mujoco.MjModel, outputs: Collection[str]) -> lis
     """Those of the motion without constraints, and of sensors."""
     import mujoco
 
-    sensors = _find_sensors(model, outputs)
+    sensors = find_sensors(model, outputs)
     fields = FIELDS | (SENSOR_FIELDS if sensors.size else {})
     features = _list_fields(model, fields)
     for field, (kind, name, supported) in ACTUATOR_TYPES.items():
@@ -63,8 +63,8 @@ def list_smooth_features(model: mujoco.MjModel, outputs: Collection[str]) -> lis
     return [*features, *_list_options(model), *_list_sensors(model, sensors)]
 
 
-def _find_sensors(model: mujoco.MjModel, outputs: Collection[str]) -> np.ndarray:
-    """The numbers of the sensors that are wanted, as "sensordata" or "sensordata[name]"."""
+def find_sensors(model: mujoco.MjModel, outputs: Collection[str]) -> np.ndarray:
+    """The numbers of the sensors whose values are among the outputs, as "sensordata" or "sensordata[name]"."""
     import mujoco
 
     names = [name[len("sensordata[") : -1] for name in outputs if name.startswith("sensordata[")]

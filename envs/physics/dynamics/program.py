@@ -12,9 +12,9 @@ from envs.physics.dynamics.choice import choose_pairs
 from envs.physics.dynamics.constrained import make_inverse_solver, make_solver
 from envs.physics.dynamics.data import extend
 from envs.physics.dynamics.forward import Solver, evaluate, find_inverse, find_kinematics, step_with_flag, unconstrained
-from envs.physics.dynamics.sensors import OF_CONSTRAINTS, list_sensors
+from envs.physics.dynamics.sensors import OF_CONSTRAINTS
 from envs.physics.dynamics.watch import may_touch
-from envs.physics.features import unsupported_features
+from envs.physics.features import find_sensors, unsupported_features
 from envs.physics.fields import KINEMATICS, MODEL, find_outputs, list_fields, make_single_step
 from envs.physics.interpreter import Program, trace
 from envs.physics.models import put_model
@@ -126,8 +126,8 @@ def _make_single(model, inputs: tuple[str, ...], outputs: tuple[str, ...], funct
 
 def _needs_solution(model, outputs: tuple[str, ...]) -> bool:
     """Whether an output depends on the constraints."""
-    fields = list_fields(outputs)
-    return bool(set(fields) & set(SOLVED)) or any(kind in OF_CONSTRAINTS for kind in list_sensors(model, outputs))
+    sensors = model.sensor_type[find_sensors(model, outputs)].tolist()
+    return not OF_CONSTRAINTS.isdisjoint(sensors) or not set(SOLVED).isdisjoint(list_fields(outputs))
 
 
 def _check_features(model, outputs: tuple[str, ...]) -> None:

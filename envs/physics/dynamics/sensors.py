@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import functools
-from collections.abc import Collection
 from typing import TYPE_CHECKING, Any
 
 import jax.numpy as jnp
@@ -31,7 +30,6 @@ from envs.physics.dynamics.rotations import (
 from envs.physics.dynamics.smooth import Smooth
 from envs.physics.dynamics.transmissions import find_tendon_pulls, find_tendon_rates
 from envs.physics.dynamics.tree import BALL, FREE
-from envs.physics.fields import find_outputs
 from envs.physics.models import import_mjx
 from envs.physics.pairs import SHAPES
 
@@ -47,15 +45,6 @@ OF_CONSTRAINTS = frozenset(
 )  # fmt: skip
 JOINT_LIMITS = [SENSOR.JOINTLIMITPOS, SENSOR.JOINTLIMITVEL, SENSOR.JOINTLIMITFRC]
 TENDON_LIMITS = [SENSOR.TENDONLIMITPOS, SENSOR.TENDONLIMITVEL, SENSOR.TENDONLIMITFRC]
-
-
-def list_sensors(model: mujoco.MjModel, outputs: Collection[str]) -> list[int]:
-    """The types of the sensors whose values are among the outputs."""
-    places = [place for field, place in find_outputs(model, outputs) if field == "sensordata"]
-    if any(place is None for place in places):
-        return model.sensor_type.tolist()
-    begins = [place.start for place in places if isinstance(place, slice)]
-    return model.sensor_type[np.isin(model.sensor_adr, begins)].tolist()
 
 
 def add_readings(model: mujoco.MjModel, mx: mjx.Model, d: Any, smooth: Smooth, names=(), sensors: bool = True) -> Any:
