@@ -52,6 +52,7 @@ from envs.physics import (
     load_spec,
     scalarize,
 )
+from envs.physics.dynamics.bounds import choose_bounds
 from envs.physics.dynamics.choice import choose_pairs, count_points
 from envs.physics.dynamics.forward import find_positions
 from envs.physics.dynamics.watch import may_touch
@@ -157,12 +158,12 @@ class InC:
 
 def count_left(model: mujoco.MjModel, watched: list, positions: np.ndarray) -> float:
     """The share of the positions `[..., nq]` in which a watched pair may touch."""
-    mx = put_model(model)
+    mx, bounds = put_model(model), choose_bounds(model, watched)
     data = import_mjx().make_data(mx)
 
     def is_near(qpos):
         placed, _ = find_positions(model, mx, data.replace(qpos=qpos))
-        return may_touch(model, placed, watched).astype(float)
+        return may_touch(placed, bounds).astype(float)
 
     is_near_fast = scalarize(is_near, jnp.zeros(model.nq))
     flags = jax.jit(jax.vmap(is_near_fast))(jnp.asarray(positions.reshape(-1, model.nq), jnp.float32))
@@ -193,6 +194,11 @@ def measure_memory(path: Path, options) -> list[float]:
 # --- one model --------------------------------------------------------------------------------------------------------
 
 
+def name_model(path: Path) -> str:
+    """A model file's name in tables, with that of its folder."""
+    return path.stem if path.parent == ASSETS else f"{path.resolve().parent.name}/{path.stem}"
+
+
 def load(path: Path) -> mujoco.MjModel:
     """The model of a file, without collisions of meshes."""
     model = change_collision(compile_model(load_spec(path)), "primitives")
@@ -203,7 +209,7 @@ def load(path: Path) -> mujoco.MjModel:
 
 def measure_model(path: Path, options) -> dict[str, Any]:
     """Everything about one model file; of one that cannot be stepped, what MuJoCo or we say of it."""
-    name = path.stem if path.parent == ASSETS else f"{path.parent.name}/{path.stem}"
+    name = name_model(path)
     try:
         row = {"model": name, **measure_speeds(load(path), options)}
         return row | ({"memory": measure_memory(path, options)} if options.memory else {})

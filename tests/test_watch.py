@@ -15,8 +15,10 @@ from scipy.spatial.transform import Rotation
 
 from envs.physics import compile_step
 from envs.physics.dynamics import forward
+from envs.physics.dynamics.bounds import choose_bounds
 from envs.physics.dynamics.choice import MOST_CONTACTS, choose_pairs, count_points
-from envs.physics.dynamics.watch import MANY_PAIRS, _list_solids, may_touch
+from envs.physics.dynamics.solids import list_enclosures, make_solids
+from envs.physics.dynamics.watch import Bound, may_touch
 from envs.physics.interpreter import trace
 from envs.physics.models import put_model
 from envs.physics.numeric import evaluate
@@ -45,15 +47,21 @@ def make_geom(shape, rng, margin=0.0):
     return f'<geom {SHAPES[shape].format(*numbers)} {place} margin="{margin}" mass="1"/>'
 
 
-def compare(model, spread, number=1000, seed=0):
+def bound_each(model, pairs):
+    """The bound of each pair by the shapes of its geoms."""
+    solids = make_solids(model)
+    return [Bound(solids[pair.geom1], solids[pair.geom2], find_margin(model, pair)) for pair in pairs]
+
+
+def compare(model, spread, number=1000, seed=0, bound=bound_each):
     """(ours, true): whether the watched pairs may touch in random states, and whether they do in C MuJoCo."""
     rng, data = np.random.default_rng(seed), mujoco.MjData(model)
     mx = put_model(model)
-    start, pairs = mjx.make_data(mx), colliding_pairs(model)
+    start, bounds = mjx.make_data(mx), bound(model, colliding_pairs(model))
 
     def watch(qpos):
         d, _ = forward.find_positions(model, mx, start.replace(qpos=qpos))
-        return may_touch(model, d, pairs)
+        return may_touch(d, bounds)
 
     qpos = rng.normal(size=(number, model.nbody - 1, 7))
     qpos[:, :, :3] *= spread
@@ -101,28 +109,112 @@ def test_what_touches_a_plane_is_flagged(shape, in_float64):
     assert (ours & ~true).sum() < (0.2 if shape == "mesh" else 0.02) * ours.sum()
 
 
-def test_bundles_of_a_body(in_float64):
-    """Of very many pairs a body's spheres and capsules are one capsule around them, and its boxes one box."""
-    rng = np.random.default_rng(0)
+def draw_points(solid, rng, number=500):
+    """Points on the surface of a geom, among them the corners of a box."""
+    unit = rng.normal(size=(number, 3))
+    unit /= np.linalg.norm(unit, axis=1, keepdims=True)
+    radius, length = solid.size[:2]
+    ends = np.sign(unit[:, 2:]) * [0.0, 0.0, length]
+    round_side = unit * [1, 1, 0] / np.linalg.norm(unit[:, :2], axis=1, keepdims=True)
+    points = {
+        "sphere": radius * unit,
+        "capsule": radius * unit + ends,
+        "ellipsoid": unit * solid.size,
+        "cylinder": radius * round_side + ends,
+        "box": np.sign(unit) * solid.size,
+        "mesh": np.sign(unit) * solid.size,
+    }[solid.shape]
+    return solid.middle + points @ solid.axes.T
+
+
+@pytest.mark.parametrize("number", [1, 2, 4])
+def test_enclosures_have_all_of_their_geoms_inside(number):
+    rng = np.random.default_rng(number)
+    for _ in range(20):
+        shapes = rng.choice(list(SHAPES), number)
+        solids = make_solids(floating([[make_geom(shape, rng) for shape in shapes]]))
+        points = np.concatenate([draw_points(solid, rng) for solid in solids])
+        found = list_enclosures(solids)
+        assert found[0].shape == "sphere"
+        for solid in found:
+            beyond = find_depth(solid, points)
+            assert beyond.max() < 1e-9, solid
+            assert solid.shape != "sphere" or beyond.max() > -0.05 * solid.radius  # and no larger than needed
+
+
+def find_depth(solid, points):
+    """How far points are outside of the capsule around a solid, or of a box; negative inside."""
+    offset = points - solid.middle
+    share = np.clip(offset @ solid.half / max(solid.half @ solid.half, 1e-30), -1, 1)
+    beyond = np.linalg.norm(offset - share[:, None] * solid.half, axis=1) - solid.radius
+    if solid.shape == "box":
+        return np.maximum(beyond, (np.abs(offset @ solid.axes) - solid.size).max(1))
+    return beyond
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_chosen_bounds_miss_nothing(seed, in_float64):
+    """Bodies of geoms of all shapes, above a plane, also where they never were in the simulations."""
+    rng = np.random.default_rng(seed)
+    bodies = [
+        [make_geom(shape, rng, margin=0.02 * (i == 1)) for shape in rng.permutation(list(SHAPES))] for i in (0, 1)
+    ]
+    model = floating(bodies, '<geom type="plane" size="1 1 1" pos="0 0 -.8"/>')
+    ours, true = compare(model, 0.5, bound=choose_bounds)
+    assert 0.1 < true.mean() < 0.95
+    assert not (true & ~ours).any()
+    assert not ours.all()
+
+
+def test_bounds_of_rows_of_geoms(in_float64):
+    """A row of spheres and capsules is one capsule, and one of boxes one box."""
     line = [f'<geom size=".05" pos="0 0 {0.07 * i}"/>' for i in range(6)]
     line += [f'<geom type="capsule" size=".04 .1" pos=".03 0 {0.1 * i}" quat="1 .1 0 0"/>' for i in range(5)]
-    model = floating([line, line, [make_geom("box", rng), '<geom size=".05" pos=".4 0 0"/>']])
-    check_bundles(model)
+    check_rows(floating([line, line]))
     box = '<geom type="box" size=".1 .05 .07" pos="{} {} 0" quat="1 .05 -.03 {}"/>'
     row = [box.format(0.1 * i, 0.02 * (i % 2), 0.01 * i) for i in range(9)]
-    check_bundles(floating([row, [*row, make_geom("cylinder", rng)]]))
+    check_rows(floating([row, row]))
 
 
-def check_bundles(model):
-    """They are few, and neither miss a contact nor say too often that there may be one."""
+def check_rows(model):
+    """Their bounds are few, and neither miss a contact nor say too often that there may be one."""
     pairs = colliding_pairs(model)
-    assert len(pairs) > MANY_PAIRS
-    assert len(_list_solids(model, pairs)) < len(pairs) / 5
-    ours, true = compare(model, 0.5)
+    assert len(choose_bounds(model, pairs)) < len(pairs) / 5
+    ours, true = compare(model, 0.5, bound=choose_bounds)
     assert true.any()
     assert not (true & ~ours).any()
     assert not ours.all()
     assert (ours & true).sum() > 0.3 * ours.sum()
+
+
+def test_bodies_that_stay_apart_have_one_bound_of_spheres():
+    """And those that come near have bounds that tell a miss from a contact."""
+    apart = choose_bounds(*with_pairs(crosses(3.0)))
+    assert [(bound.one.shape, bound.other.shape) for bound in apart] == [("sphere", "sphere")]
+    near = choose_bounds(*with_pairs(crosses(0.8)))
+    assert len(near) > 1
+    assert "capsule" in {bound.one.shape for bound in near} | {bound.other.shape for bound in near}
+
+
+def crosses(distance):
+    """Two crosses of capsules at this distance (m), with arms of 0.5 m, that turn in nearly the same plane."""
+    capsules = [f'<geom type="capsule" size=".02" fromto="{x} 0 {z} {-x} 0 {-z}"/>' for x, z in ((0.5, 0), (0, 0.5))]
+    cross = f'<joint axis="0 1 0"/>{"".join(capsules)}</body>'
+    bodies = f'<body>{cross}<body pos="{distance} .03 0">{cross}'
+    return mujoco.MjModel.from_xml_string(f"<mujoco><worldbody>{bodies}</worldbody></mujoco>")
+
+
+def with_pairs(model):
+    return model, colliding_pairs(model)
+
+
+def test_a_pair_that_is_listed_twice_has_one_bound():
+    """With the larger margin."""
+    text = """<mujoco><worldbody><body><freejoint/><geom name="a" size=".1"/></body><body pos="1 0 0"><freejoint/>
+    <geom name="b" size=".1"/></body></worldbody><contact><pair geom1="a" geom2="b" margin=".01"/>
+    <pair geom1="b" geom2="a" margin=".02"/></contact></mujoco>"""
+    bounds = choose_bounds(*with_pairs(mujoco.MjModel.from_xml_string(text)))
+    assert [bound.margin for bound in bounds] == [0.02]
 
 
 def test_what_is_far_is_not_flagged(in_float64):
@@ -165,7 +257,7 @@ def test_nearly_parallel_capsules_are_flagged(radius):
 
     def watch(qpos):
         d, _ = forward.find_positions(model, mx, start.replace(qpos=qpos))
-        return jnp.stack([may_touch(model, d, [pair]) for pair in pairs])
+        return jnp.stack([may_touch(d, [each]) for each in bound_each(model, pairs)])
 
     qpos = draw_crossings(np.random.default_rng(0), 3000, 2 * radius + margin)
     (ours,) = evaluate(trace(watch, qpos[0].ravel()), [qpos.reshape(len(qpos), -1)])

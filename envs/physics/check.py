@@ -115,13 +115,20 @@ def _converge(model: mujoco.MjModel) -> mujoco.MjModel:
 
 
 def _list_starts(model: mujoco.MjModel) -> list[dict[str, np.ndarray]]:
-    """The initial state, the same perturbed (0.1 rad or m, and per second) and up to three keyframes."""
+    """The initial state, the same perturbed (0.1 rad or m, and per second) and up to three keyframes.
+
+    The perturbed positions are within the joints' ranges: no equations are made for geoms that meet only beyond them.
+    """
     import mujoco
 
     random, data = np.random.default_rng(0), mujoco.MjData(model)
     starts = [{name: getattr(data, name).copy() for name in ("qpos", "qvel", "act")} for _ in range(2)]
     speeds = 0.1 * random.normal(size=(2, model.nv))
     mujoco.mj_integratePos(model, starts[1]["qpos"], speeds[0], 1.0)
+    is_scalar = model.jnt_type >= int(mujoco.mjtJoint.mjJNT_SLIDE)  # or a hinge
+    limited = np.flatnonzero(model.jnt_limited.astype(bool) & is_scalar)
+    places = model.jnt_qposadr[limited]
+    starts[1]["qpos"][places] = starts[1]["qpos"][places].clip(*model.jnt_range[limited].T)
     starts[1]["qvel"] += speeds[1]
     keys = range(min(model.nkey, NUM_KEYFRAMES))
     return starts + [{n: getattr(model, f"key_{n}")[key].copy() for n in ("qpos", "qvel", "act")} for key in keys]

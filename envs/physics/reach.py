@@ -40,7 +40,7 @@ class Reach:
         import mujoco
 
         self._model, self._data = model, mujoco.MjData(model)
-        self._low, self._high = _find_ranges(model)
+        self._low, self._high = find_ranges(model)
         self._is_plane = model.geom_type == mujoco.mjtGeom.mjGEOM_PLANE
         self._is_unknown = model.geom_type == mujoco.mjtGeom.mjGEOM_HFIELD
         self._centre, self._axis, self._radius = enclose_geoms(model)
@@ -228,7 +228,7 @@ def _split(boxes: np.ndarray, undecided: np.ndarray, moves: np.ndarray) -> tuple
     return np.concatenate([lower, upper]), np.concatenate([undecided, undecided])
 
 
-def _find_ranges(model: mujoco.MjModel) -> tuple[np.ndarray, np.ndarray]:
+def find_ranges(model: mujoco.MjModel) -> tuple[np.ndarray, np.ndarray]:
     """Bounds of each joint's position, infinite where there are none, that include the initial one and keyframes."""
     import mujoco
 
@@ -247,7 +247,9 @@ def _find_ranges(model: mujoco.MjModel) -> tuple[np.ndarray, np.ndarray]:
 def enclose_geoms(model: mujoco.MjModel) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Capsules around the geoms, in their frames: the middle, half the segment, and the radius.
 
-    A box lies within the capsule whose segment is its longest axis, and whose radius is half its other diagonal.
+    A box lies within the capsule whose segment is its longest axis, and whose radius is half its other diagonal. An
+    ellipsoid of semi-axes a >= b >= c lies within a capsule as long as itself, of radius b: at x > a - b along its
+    axis, (x - a + b)^2 + b^2 (1 - x^2 / a^2) is convex in x and at both ends at most b^2.
     """
     import mujoco
 
@@ -266,6 +268,7 @@ def enclose_geoms(model: mujoco.MjModel) -> tuple[np.ndarray, np.ndarray, np.nda
             centre[geom], axis[geom], radius[geom] = 0, 0, 0
         elif name == "ELLIPSOID":
             radius[geom] = size[geom, others[geom]].max()
+            axis[geom, longest[geom]] -= radius[geom]
     return centre, axis, radius
 
 

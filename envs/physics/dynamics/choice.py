@@ -2,23 +2,18 @@
 
 from __future__ import annotations
 
-import itertools
-from collections import Counter
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Collection, Sequence
 
 import mujoco
 import numpy as np
 
-from envs.physics.callback import INITIAL_COUNT, has_diverged
 from envs.physics.dynamics.kinematics import find_carriers
 from envs.physics.dynamics.shapes import DEEPEST_ONLY, NUM_CONTACTS
-from envs.physics.models import find_control_ranges
+from envs.physics.dynamics.simulations import COMMANDED, simulate
 from envs.physics.pairs import Pair, get_shapes
 from envs.physics.primitives import UnsupportedPrimitiveError
 
 MOST_CONTACTS = 32  # points of contact that the equations of a step may have
-SECONDS = 1.0  # of each simulation that shows what touches, from each keyframe, or else from the initial position
-COMMANDED = 16  # simulations with random commands
 SELDOM = 0.05  # share of the steps without commands; what touches in fewer is not chosen
 LIGHT = 80  # as `_weigh` has it: some 500 equations
 OFTEN = 0.2  # share of the steps with random commands, which are rougher than those of most tasks
@@ -97,6 +92,24 @@ def count_points(model: mujoco.MjModel, pairs: Sequence[Pair]) -> int:
     return sum(NUM_CONTACTS[get_shapes(model, pair)] for pair in pairs)
 
 
+def drop_rarest(model: mujoco.MjModel, pairs: Sequence[Pair], share: float) -> tuple[list[Pair], list[Pair]]:
+    """(kept, dropped): drops those that touch least often, until their equations are a share of those of all.
+
+    First the share of the steps without commands counts, then that of the steps with commands. At least one is dropped.
+
+    Args:
+      model: a compiled model.
+      pairs: chosen pairs, one or more.
+      share: of the equations of all these contacts, in which each has as many as `_weigh` has it.
+    """
+    samples = [simulate(model, commanded).counts for commanded in (0, COMMANDED)[: 1 + bool(model.nu)]]
+    rarest = sorted(pairs, key=lambda pair: [counts[frozenset((pair.geom1, pair.geom2))] for counts in samples])
+    reached = np.cumsum([_weigh(model, pair) for pair in rarest])
+    number = 1 + int(np.searchsorted(reached, share * reached[-1]))
+    dropped = rarest[:number]
+    return [pair for pair in pairs if pair not in dropped], dropped
+
+
 def _list_frequent(model: mujoco.MjModel, pairs: Sequence[Pair], commanded: int, least: float) -> list[Pair]:
     """The pairs that touch in at least a share of the steps of simulations, most frequent first.
 
@@ -107,29 +120,6 @@ def _list_frequent(model: mujoco.MjModel, pairs: Sequence[Pair], commanded: int,
     """
     if not pairs or (commanded and not model.nu):
         return []
-    counts: Counter[frozenset[int]] = Counter()
-    starts = list(range(model.nkey)) or [None]
-    runs = list(itertools.islice(itertools.cycle(starts), commanded)) if commanded else starts
-    random, num_steps = np.random.default_rng(0), 0
-    for key in runs:
-        data = mujoco.MjData(model)
-        if key is not None:
-            mujoco.mj_resetDataKeyframe(model, data, key)
-        if commanded:
-            data.ctrl[:] = random.uniform(*find_control_ranges(model))
-        for touching in _simulate(model, data):
-            counts.update(touching)
-            num_steps += 1
-    share = {pair: counts[frozenset((pair.geom1, pair.geom2))] / max(num_steps, 1) for pair in pairs}
+    found = simulate(model, commanded)
+    share = {pair: found.counts[frozenset((pair.geom1, pair.geom2))] / max(found.num_steps, 1) for pair in pairs}
     return sorted((pair for pair in pairs if share[pair] >= least), key=lambda pair: -share[pair])
-
-
-def _simulate(model: mujoco.MjModel, data: mujoco.MjData) -> Iterator[set[frozenset[int]]]:
-    """The pairs of geoms that touch in each step, until the end or until the motion diverges."""
-    data.warning.number[:] = INITIAL_COUNT
-    for _ in range(max(int(SECONDS / model.opt.timestep), 1)):
-        mujoco.mj_step(model, data)
-        if has_diverged(data.warning.number):
-            return
-        touching = data.contact.geom[np.asarray(data.contact.efc_address) >= 0]
-        yield {frozenset(geoms) for geoms in touching.tolist()}

@@ -8,22 +8,18 @@ import jax
 import jax.numpy as jnp
 import mujoco
 
-from envs.physics.dynamics.choice import choose_pairs
 from envs.physics.dynamics.constrained import make_inverse_solver, make_solver
 from envs.physics.dynamics.data import extend
+from envs.physics.dynamics.division import Division, make_within_size
 from envs.physics.dynamics.forward import Solver, evaluate, find_inverse, find_kinematics, step_with_flag, unconstrained
 from envs.physics.dynamics.sensors import OF_CONSTRAINTS
-from envs.physics.dynamics.watch import may_touch
+from envs.physics.dynamics.watch import Bound, may_touch
 from envs.physics.features import find_sensors, unsupported_features
 from envs.physics.fields import KINEMATICS, MODEL, find_outputs, list_fields, make_single_step
 from envs.physics.interpreter import Program, trace
 from envs.physics.models import put_model
-from envs.physics.pairs import Pair, candidate_pairs, has_constraints
+from envs.physics.pairs import has_constraints
 from envs.physics.primitives import UnsupportedPrimitiveError
-
-# A program with more equations takes minutes to compile, and is not faster than C MuJoCo.
-LARGEST_PROGRAM = 30_000
-
 
 # Fields that depend on the solution of the constraints.
 SOLVED = ("qacc", "qfrc_constraint", "qfrc_inverse", "cfrc_ext")
@@ -48,10 +44,17 @@ def trace_step(
       UnsupportedPrimitiveError: the step has no such form, or a very long one.
       MujocoModelError: MJX does not take the model.
     """
-    fields = list_fields(outputs)
     _check_features(model, outputs)
-    pairs, watched = _divide_pairs(model, inputs)
-    solve = _watch(watched, make_solver(pairs, differentiable))
+
+    def make(division: Division) -> Program:
+        return _trace_divided_step(model, inputs, outputs, differentiable, division)
+
+    return make_within_size(model, _list_varying(inputs), make)
+
+
+def _trace_divided_step(model, inputs: tuple[str, ...], outputs: tuple[str, ...], differentiable: bool, division):
+    fields = list_fields(outputs)
+    solve = _watch(division.bounds, make_solver(division.chosen, differentiable))
     written_out = differentiable or not has_constraints(model)
     flags = []
 
@@ -66,7 +69,7 @@ def trace_step(
         *given, flag = arrays
         return *single(*given), jnp.maximum(flag, flags[-1])
 
-    return _check_size(trace(single_with_flag, *example, jnp.zeros(())) if watched else trace(single, *example))
+    return trace(single_with_flag, *example, jnp.zeros(())) if division.bounds else trace(single, *example)
 
 
 def trace_fields(
@@ -91,19 +94,29 @@ def trace_fields(
     Raises:
       As `trace_step`, but for positions alone, which every model has.
     """
-    fields, flags = list_fields(outputs), []
+    fields = list_fields(outputs)
     if set(fields) <= set(KINEMATICS):
 
         def place(mx, d):
             return find_kinematics(model, mx, extend(model, d), fields)
 
         single, example = _make_single(model, inputs, outputs, place)
-        return _check_size(trace(single, *example))
+        return make_within_size(model, (), lambda _: trace(single, *example), has_contacts=False)
     _check_features(model, outputs)
-    is_solved = _needs_solution(model, outputs)
-    pairs, watched = _divide_pairs(model, inputs) if is_solved else ([], [])
+
+    def make(division: Division) -> Program:
+        return _trace_divided_fields(model, inputs, outputs, inverse, differentiable, division)
+
+    return make_within_size(model, _list_varying(inputs), make, has_contacts=_needs_solution(model, outputs))
+
+
+def _trace_divided_fields(
+    model, inputs: tuple[str, ...], outputs: tuple[str, ...], inverse: bool, differentiable: bool, division: Division
+) -> Program:
+    fields, flags = list_fields(outputs), []
     make = make_inverse_solver if inverse else make_solver
-    solve = _watch(watched, make(pairs, differentiable) if is_solved else unconstrained)
+    is_solved = _needs_solution(model, outputs)
+    solve = _watch(division.bounds, make(division.chosen, differentiable) if is_solved else unconstrained)
 
     def compute(mx, d):
         d, smooth = evaluate(model, mx, extend(model, d), solve, also=fields)
@@ -115,7 +128,7 @@ def trace_fields(
     def single_with_flag(*arrays):
         return *single(*arrays), jnp.asarray(flags[-1])
 
-    return _check_size(trace(single_with_flag if watched else single, *example))
+    return trace(single_with_flag if division.bounds else single, *example)
 
 
 @jax.ensure_compile_time_eval()  # also where a caller is traced, whose derivative needs another program
@@ -136,27 +149,17 @@ def _check_features(model, outputs: tuple[str, ...]) -> None:
         raise UnsupportedPrimitiveError(f"{'; '.join(features)}: leave out what the task does not need")
 
 
-def _divide_pairs(model, inputs: tuple[str, ...]) -> tuple[list[Pair], list[Pair]]:
-    """The pairs of geoms whose contacts are equations, and those that are watched."""
-    varying = [name.removeprefix(MODEL) for name in inputs if name.startswith(MODEL)]
-    return choose_pairs(model, candidate_pairs(model, varying), varying)
+def _list_varying(inputs: tuple[str, ...]) -> list[str]:
+    """The fields of the model that are inputs."""
+    return [name.removeprefix(MODEL) for name in inputs if name.startswith(MODEL)]
 
 
-def _watch(watched: Sequence[Pair], solve: Solver) -> Solver:
-    """The solver, which also sets the flag where one of these pairs may touch."""
+def _watch(bounds: Sequence[Bound], solve: Solver) -> Solver:
+    """The solver, which also sets the flag where geoms may touch by one of these bounds."""
 
     def watch_and_solve(model, mx, d, smooth):
-        if watched:
-            smooth.flag = may_touch(model, d, watched).astype(float)
+        if bounds:
+            smooth.flag = may_touch(d, bounds).astype(float)
         return solve(model, mx, d, smooth)
 
     return watch_and_solve
-
-
-def _check_size(program: Program) -> Program:
-    if len(program) > LARGEST_PROGRAM:
-        raise UnsupportedPrimitiveError(
-            f"its {len(program):,} equations take too long to compile: <contact><exclude body1= body2=/></contact> or "
-            "contype and conaffinity leave out contacts that are not needed"
-        )
-    return program
