@@ -1,6 +1,7 @@
 """Claim: models move as in C MuJoCo, for many steps as well as for one, in float64 and in float32.
 
     python experiments/long_run.py [robots=FOLDER] [FILE ...] [--envs 16] [--steps 50] [--long_steps 100000]
+                                   [--systems NAME_OR_FILE ...]
 
 Two tables.
 
@@ -11,9 +12,10 @@ and a maximum over the environments, which begin at a keyframe or else the initi
 both sides. C MuJoCo's solver ends at the solution. What moves chaotically multiplies rounding errors: "C itself" is
 C MuJoCo's own difference after its velocities are changed by 1e-12 of themselves at the beginning.
 
-For some systems 100,000 steps in float32, in float64 and by C MuJoCo, with the same controls: mechanical energy at the
-start, its average over the last tenth and its range, the largest depth of a contact (below its margin) and the largest
-excess of a joint's limit, after each tenth step. Trajectories soon differ, as they are chaotic; these numbers must not.
+For some systems, or the named ones and model files, 100,000 steps in float32, in float64 and by C MuJoCo, with the same
+controls: mechanical energy at the start, its average over the last tenth and its range, the largest depth of a contact
+(below its margin) and the largest excess of a joint's limit, after each tenth step. Trajectories soon differ, as they
+are chaotic; these numbers must not.
 Also the ratio of our largest depth and excess to C MuJoCo's.
 
 Prints the tables and writes results/long_run.json.
@@ -35,12 +37,13 @@ import mujoco.rollout
 import numpy as np
 from commands import Parser, count, write_json
 from measuring import CORES
-from robots import list_files, load, make_controls, make_states
+from robots import list_files, load, make_controls, make_states, name_model
 
 from envs.base import ASSETS
 from envs.physics import MujocoModelError, compile_step, describe
 from envs.physics.models import find_control_ranges
 from jaxpg.commands.ending import run_command
+from jaxpg.errors import UserError
 
 QUICK = {"xla_backend_optimization_level": 0}
 SAMPLED = 10  # steps between two states that energy and depth are computed of
@@ -125,7 +128,7 @@ def compare(ours: list, true: list) -> dict[str, Any]:
 
 def compare_model(path: Path, options) -> dict[str, Any]:
     """The differences of one model file; of one that cannot be stepped, what MuJoCo or we say of it."""
-    name = path.stem if path.parent == ASSETS else f"{path.parent.name}/{path.stem}"
+    name = name_model(path)
     try:
         model = converge(load(path))
     except MujocoModelError as error:
@@ -155,6 +158,13 @@ def show_model(row: dict[str, Any]) -> None:
 
 
 # --- some systems, many steps -----------------------------------------------------------------------------------------
+
+
+def find_systems(given: Sequence[str]) -> dict[str, str | Path]:
+    """The systems of the given names and model files."""
+    if unknown := [name for name in given if name not in SYSTEMS and not Path(name).is_file()]:
+        raise UserError(f"{unknown[0]}: expected a model file or one of {'; '.join(SYSTEMS)}")
+    return {name_model(Path(name)) if name not in SYSTEMS else name: SYSTEMS.get(name, Path(name)) for name in given}
 
 
 def load_system(source: str | Path) -> mujoco.MjModel:
@@ -240,8 +250,9 @@ def main(arguments: Sequence[str]) -> None:
     parser.add_argument("--envs", type=count, default=16)
     parser.add_argument("--steps", type=count, default=50)
     parser.add_argument("--long_steps", type=count, default=100_000)
+    parser.add_argument("--systems", nargs="+", default=list(SYSTEMS), metavar="NAME_OR_FILE", help="of the long runs")
     options = parser.parse_args(arguments)
-    files, models, systems = list_files(options.files), [], []
+    files, long, models, systems = list_files(options.files), find_systems(options.systems), [], []
     print(
         f"model, differences in {options.steps} steps: position (median, maximum), velocity (median, maximum); "
         "C itself: position (median, maximum)"
@@ -255,7 +266,7 @@ def main(arguments: Sequence[str]) -> None:
         "excess of a limit [rad or m], and each of them over C's"
     )
     steps = -(-options.long_steps // (SAMPLED * PARTS)) * SAMPLED * PARTS
-    for name, source in SYSTEMS.items():
+    for name, source in long.items():
         systems.append(run_system(name, source, steps))
         show_system(systems[-1])
         write_json("long_run.json", {"models": models, "systems": systems})

@@ -10,9 +10,13 @@ observations, rewards, time limits and resets, of
     mujoco    env.physics=mujoco: C MuJoCo
     mjx       env.physics=mjx: what brax and Playground do
 
-one after the other in each round, and the mean reward of a step from the same first states under the same actions,
-over 20 steps of all environments. Rewards differ where MJX's solver ends before the solution, as brax and Playground
-ask for in some of their models, and by chance where motion is chaotic.
+one after the other in each round; by how much the first is faster than the others; and by how much for each second of a
+core's time, which a busy machine hardly changes.
+
+Also the mean reward of a step over 20 steps of all environments, each up to the end of its first episode, from the same
+first states under the same actions; and by how much an environment's mean reward differs from that with C MuJoCo
+(median and maximum of the environments). Rewards differ where the solver of C MuJoCo and MJX ends before the solution,
+as brax and Playground ask for in some of their models, and by chance where motion is chaotic.
 
 Prints one table and writes results/mujoco_environments.json: medians of the rounds with the smallest and the largest.
 """
@@ -33,7 +37,7 @@ from measuring import compile_in_parts, count_parts, divide_cpu, summarise, time
 import envs
 from envs.options import OptionError
 from jaxpg.commands.ending import run_command
-from jaxpg.vector_env import vectorize
+from jaxpg.vector_env import VectorState, vectorize
 
 PHYSICS = ("scalar", "mujoco", "mjx")
 BRAX = ("inverted_pendulum", "inverted_double_pendulum", "reacher", "hopper", "walker2d", "halfcheetah", "pusher")
@@ -55,34 +59,51 @@ class Batch:
         vector = vectorize(env, part, LENGTH)
 
         def reset(keys):
-            return vector.reset(keys[0])
+            state = jax.vmap(env.reset)(keys)  # `vector.reset` has one key, so a state would depend on the parts
+            zeros = jnp.zeros_like(state.reward)
+            return VectorState(state, zeros.astype(jnp.int32), zeros, zeros + 1)
 
         def play(state, keys):
-            def step(state, key):
-                action, again = jax.random.split(key)
-                size = (part, vector.action_size)
-                state, outcome = vector.step(state, jax.random.uniform(action, size, minval=-1.0), again)
-                return state, outcome.reward
+            def draw(number):
+                return jax.vmap(lambda key: jax.random.fold_in(key, number))(keys)
 
-            state, rewards = jax.lax.scan(step, state, jax.random.split(keys[0], options.steps))
-            return state, jnp.mean(rewards, 0)
+            def step(state, t):
+                action = jax.vmap(lambda key: jax.random.uniform(key, (vector.action_size,), minval=-1.0))(draw(t))
+                state, outcome = vector.step(state, action, draw(options.steps + t)[0])
+                return state, (outcome.reward, outcome.terminated)
+
+            state, found = jax.lax.scan(step, state, jnp.arange(options.steps))
+            return state, jax.tree.map(jnp.transpose, found)
 
         self.size = options.envs * options.steps
         self.keys = jax.random.split(jax.random.key(0), options.envs)
         self.state = compile_in_parts(reset, number)(self.keys)
         self.run = compile_in_parts(play, number).lower(self.state, self.keys).compile()
         self.seconds = time.perf_counter() - began
-        self.reward = float(np.mean([self.play() for _ in range(max(1, COMPARED // options.steps))]))
+        self.rewards = average_rewards([self.play() for _ in range(max(1, COMPARED // options.steps))])
 
-    def play(self) -> float:
-        """The mean reward of a step."""
+    def play(self) -> tuple[jax.Array, jax.Array]:
+        """Rewards and whether an episode terminated, of the next steps, `[N, T]`."""
         self.keys = jax.vmap(lambda key: jax.random.fold_in(key, 1))(self.keys)
-        self.state, rewards = self.run(self.state, self.keys)
-        return float(jnp.mean(rewards))
+        self.state, found = jax.block_until_ready(self.run(self.state, self.keys))
+        return found
 
-    def measure(self) -> float:
-        """Environment steps per second."""
-        return self.size * time_calls(self.play, SECONDS)[0]
+    def measure(self) -> np.ndarray:
+        """Environment steps per second, and per second of all cores' time."""
+        return self.size * time_calls(self.play, SECONDS)
+
+
+def average_rewards(parts: list[tuple[jax.Array, jax.Array]]) -> np.ndarray:
+    """The mean reward of a step up to the end of the first episode, `[N]`; what follows depends on the resets."""
+    rewards, ended = (np.concatenate(x, 1) for x in zip(*parts, strict=True))
+    first = np.cumsum(ended, 1) - ended == 0
+    return np.sum(rewards * first, 1) / np.sum(first, 1)
+
+
+def compare_rewards(batches: dict[str, Batch], physics: str) -> list[float]:
+    """By how much mean rewards of environments differ from those with C MuJoCo: (median, maximum)."""
+    differences = np.abs(batches[physics].rewards - batches["mujoco"].rewards)
+    return [float(np.median(differences)), float(np.max(differences))]
 
 
 def measure_environment(name: str, options) -> dict[str, Any]:
@@ -91,9 +112,12 @@ def measure_environment(name: str, options) -> dict[str, Any]:
     rates = np.array([[batch.measure() for batch in batches.values()] for _ in range(options.rounds)])
     row: dict[str, Any] = {"name": name}
     for i, (physics, batch) in enumerate(batches.items()):
-        row[physics] = {"rate": summarise(rates[:, i]), "reward": batch.reward, "seconds": batch.seconds}
-    if "mjx" in batches:
-        row["ratio"] = summarise(rates[:, 0] / rates[:, kinds.index("mjx")])
+        reward = float(np.mean(batch.rewards))
+        row[physics] = {"rate": summarise(rates[:, i, 0]), "reward": reward, "seconds": batch.seconds}
+        if "mujoco" in batches and physics != "mujoco":
+            row[physics]["difference"] = compare_rewards(batches, physics)
+        ratios = rates[:, 0] / rates[:, i]
+        row[physics] |= {"ratio": summarise(ratios[:, 0]), "ratio_per_core": summarise(ratios[:, 1])}
     return row
 
 
@@ -104,8 +128,9 @@ def show(row: dict[str, Any]) -> None:
     found = [row[physics] for physics in PHYSICS if physics in row]
     rates = " ".join(f"{x['rate'][1]:11,.0f}" for x in found)
     others = " ".join(f"{x['seconds']:6.1f}" for x in found), " ".join(f"{x['reward']:8.3f}" for x in found)
-    low, middle, high = row.get("ratio", (np.nan,) * 3)
-    print(f"{row['name']:35} {rates}  {middle:7.1f} ({low:.1f} to {high:.1f})  {others[0]}  {others[1]}", flush=True)
+    ratios = " ".join(f"{x['ratio'][1]:6.1f} {x['ratio_per_core'][1]:6.1f}" for x in found[1:])
+    differences = " ".join(f"{x:.0e}" for of_one in found for x in of_one.get("difference", ()))
+    print(f"{row['name']:35} {rates}  {ratios}  {others[0]}  {others[1]}  {differences}", flush=True)
 
 
 def list_names() -> list[str]:
@@ -130,7 +155,10 @@ def main(arguments: Sequence[str]) -> None:
             parser.error(f"{name}: expected brax:NAME or playground:NAME")
     divide_cpu()
     kinds = ", ".join(physics for physics in PHYSICS if physics not in options.without)
-    print(f"environment, environment steps/s: {kinds}; scalar over mjx (range); s to compile; mean rewards")
+    print(
+        f"environment, environment steps/s: {kinds}; scalar over each of the others, and for each core's second; s "
+        "to compile; mean rewards; their differences from those with C MuJoCo (median, maximum)"
+    )
     rows = []
     for name in options.names or list_names():
         try:
