@@ -14,7 +14,7 @@ from collections.abc import Callable, Iterator, Mapping
 from types import MappingProxyType
 from typing import Any, NamedTuple
 
-from envs import arm, brax_env, pendulum, playground_env, quadratic
+from envs import arm, brax_env, drive, pendulum, playground_env, push, quadratic, reach, walk
 from envs.base import Env
 from envs.contract import conform
 from envs.options import OptionError, build, describe_unknown, find_declaration_problems
@@ -41,6 +41,10 @@ RESERVED = "id"  # in a run's config.yaml, the name of the environment among its
 REGISTRY: dict[str, Entry] = {
     "pendulum": Entry(pendulum.PendulumConfig, pendulum.Pendulum, pendulum.TRAINING),
     "arm": Entry(arm.ArmConfig, arm.Arm, arm.TRAINING),
+    "reach": Entry(reach.ReachConfig, reach.Reach, reach.TRAINING),
+    "drive": Entry(drive.DriveConfig, drive.Drive, drive.TRAINING),
+    "walk": Entry(walk.WalkConfig, walk.Walk, walk.TRAINING),
+    "push": Entry(push.PushConfig, push.Push, push.TRAINING),
     "quadratic": Entry(quadratic.QuadraticConfig, quadratic.make, quadratic.TRAINING),
     "brax": Entry(brax_env.BraxConfig, brax_env.make, brax_env.TRAINING),
     "playground": Entry(playground_env.PlaygroundConfig, playground_env.make, playground_env.TRAINING),

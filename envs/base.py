@@ -113,6 +113,7 @@ class MjxEnv:
       check: log differences from C MuJoCo's motion (`envs.physics.check_model`), which takes a second or more. The
         shipped environments leave this to the tests.
       inputs, outputs: what `physics_step` is a function of, and what it returns (`envs.physics.compile_step`).
+      collision: which geoms collide (`envs.physics.compile_step`).
     """
 
     if TYPE_CHECKING:  # a subclass has them
@@ -129,12 +130,15 @@ class MjxEnv:
         *,
         inputs: tuple[str, ...] = ("qpos", "qvel", "ctrl"),
         outputs: tuple[str, ...] = ("qpos", "qvel"),
+        collision: str | None = None,
     ):
         self.model = compile_model(spec)
         if check and physics != "mujoco":
             check_once(self.model)
         self.dt = self.model.opt.timestep * num_substeps
-        self.physics_step = compile_step(self.model, num_substeps, inputs=inputs, outputs=outputs, physics=physics)
+        self.physics_step = compile_step(
+            self.model, num_substeps, inputs=inputs, outputs=outputs, physics=physics, collision=collision
+        )
 
     @property
     def observation_size(self) -> int:

@@ -21,12 +21,17 @@ class Scene(NamedTuple):
       qpos: `qpos(State) -> [nq]`, the joint positions.
       goal: `goal(State) -> [3]`, the place that the robot should reach [m]; None if there is none.
       goal_radius: distance that counts as reached [m]; None without a goal.
+      goal_rotation: `goal_rotation(State) -> [3, 3]`, the orientation that the robot should reach, as the axes of its
+        frame in columns; None if any will do.
+      site: index of the site whose place, and orientation, should become the goal's; None if the robot has none.
     """
 
     model: Any
     qpos: Callable[[Any], jax.Array]
     goal: Callable[[Any], jax.Array] | None = None
     goal_radius: float | None = None
+    goal_rotation: Callable[[Any], jax.Array] | None = None
+    site: int | None = None
 
 
 class PhasePlane(NamedTuple):

@@ -16,12 +16,14 @@ from jaxpg.commands.ending import run_command
 from jaxpg.errors import UserError
 
 VERBS = {
+    "robot": "what a robot is, and whether it can be trained",
     "train": "trains an agent, or goes on with a run that was stopped",
     "evaluate": "plays a trained policy",
     "inspect": "what a run is, and whether its checkpoints are sound",
     "report": "the page of a run: curves, episodes to watch",
     "compare": "several runs side by side",
     "render": "a video of a trained policy",
+    "view": "a trained policy in MuJoCo's interactive viewer",
     "export": "the policy as C, ONNX or StableHLO",
 }
 

@@ -40,7 +40,7 @@ LEVELS = [
     {"deploy"},
     {"watch"},
     {"commands"},
-    {"train", "evaluate", "inspect", "export", "render", "report", "compare"}
+    {"train", "evaluate", "inspect", "export", "render", "report", "compare", "robot", "view"}
     | {"__main__", "gymnasium", "gymnasium_env"},
 ]
 FOREIGN = {0: {"jax"}, 1: {"jax", "flax"}, 2: {"jax", "optax"}}

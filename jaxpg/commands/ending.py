@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import errno
 import gc
+import logging
 import os
 import sys
 import threading
@@ -25,7 +26,7 @@ USER_ERRORS += (errno.ENOSPC, errno.EDQUOT, errno.EIO)
 def run_command(main: Callable[[Sequence[str]], int | None]) -> None:
     """Runs `sys.exit(main(arguments))`; a user's mistake ends in its message and status 2."""
     interrupted = False
-    with _redirect_output():
+    with _redirect_output(), _print_warnings():
         try:
             with Interrupts():
                 status = main(sys.argv[1:])
@@ -44,6 +45,34 @@ def run_command(main: Callable[[Sequence[str]], int | None]) -> None:
         os._exit(INTERRUPTED)  # XLA cannot be interrupted while it compiles, and Python would wait for its threads
     gc.freeze()  # without this, the last garbage collections of the interpreter take half a second
     sys.exit(status)
+
+
+class WarningPrinter(logging.Handler):
+    """Prints each line that is logged as a warning once, as it is.
+
+    A command makes its environment more than once, for training and for the report. And without a handler the first
+    library that logs by `absl` would give all later lines the form of `logging.basicConfig`.
+    """
+
+    def __init__(self):
+        super().__init__(logging.WARNING)
+        self._printed: set[str] = set()
+
+    def emit(self, record: logging.LogRecord) -> None:
+        line = self.format(record)
+        if line not in self._printed:
+            self._printed.add(line)
+            print(line, file=sys.stderr)
+
+
+@contextmanager
+def _print_warnings() -> Iterator[None]:
+    printer, root = WarningPrinter(), logging.getLogger()
+    root.addHandler(printer)
+    try:
+        yield
+    finally:
+        root.removeHandler(printer)
 
 
 def _report(problems: Sequence[str]) -> int:

@@ -30,7 +30,8 @@ def main(arguments: Sequence[str]) -> int:
     if options.backend == "mujoco":
         changes |= _make_mujoco_changes(options.run)
     with physics_cache(options.cache):
-        stored = policies.load(options.run, options.checkpoint, options.agent, changes, divided=options.policy == "jax")
+        divided = options.policy in ("jax", "baseline")
+        stored = policies.load(options.run, options.checkpoint, options.agent, changes, divided)
     play = episodes.play_gymnasium if options.backend == "gymnasium" else episodes.play_native
     with _choose_player(stored, options.policy) as player, compilation_cache(options.cache, print):
         results = play(player, options.episodes, options.seed)
@@ -79,7 +80,7 @@ def _mean(returns: Any) -> tuple[float, float]:
 
 
 def _make_mujoco_changes(run: str) -> dict[str, str]:
-    """The changed option with which C MuJoCo steps the run's environment.
+    """The changed options with which C MuJoCo steps the run's environment, with all that collides in its model.
 
     Raises:
       UserError: there is no run, or C MuJoCo cannot step its environment.
@@ -89,13 +90,17 @@ def _make_mujoco_changes(run: str) -> dict[str, str]:
     stored = config_file.load(folder.find(run).config)
     if not hasattr(stored.env, "physics"):
         raise UserError(f"backend=mujoco: env={stored.choices['env']} is not stepped by MuJoCo; backend=mjx plays it")
-    return {"env.physics": "mujoco"}
+    return {"env.physics": "mujoco"} | ({"env.collision": "all"} if hasattr(stored.env, "collision") else {})
 
 
 def _choose_player(stored: Any, form: str) -> AbstractContextManager[Any]:
-    """The stored policy itself, or its export."""
+    """The stored policy itself, its export, or the controller that it is compared with."""
     if form == "jax":
         return nullcontext(stored)
+    if form == "baseline":
+        from jaxpg.watch import episodes
+
+        return nullcontext(episodes.replace_by_baseline(stored))
     from jaxpg.deploy.exporter import replace_by_export
 
     return replace_by_export(stored, form)

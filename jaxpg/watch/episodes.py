@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import functools
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import numpy as np
 
 import envs
+from envs.base import with_fields
 from envs.batches import divide_batch
 from envs.hints import pip_install
 from jaxpg.errors import UserError
@@ -42,6 +43,33 @@ def play_native(stored: StoredPolicy, num_episodes: int, seed: int) -> Results:
     episodes = jax.tree.map(np.asarray, divide_batch(play, (None, 0))(stored.policy, starts))
     returns = penalize_diverged(episodes.episode_return, episodes.diverged)
     return Results(returns, episodes.diverged, rename_metrics(episodes.metrics))
+
+
+def replace_by_baseline(stored: StoredPolicy) -> StoredPolicy:
+    """The stored policy, replaced by the textbook controller of its environment, which sees the whole state.
+
+    Raises:
+      UserError: the environment has none.
+    """
+    if not hasattr(stored.env, "baseline"):
+        raise UserError(f"policy=baseline: env={stored.config.choices['env']} has no controller to compare with")
+    return stored._replace(env=_ObservesBaseline(stored.env), act=lambda policy, obs: obs)
+
+
+class _ObservesBaseline:
+    """An environment whose observation is the action of its own controller."""
+
+    def __init__(self, env: Any):
+        self.env = env
+
+    def reset(self, rng: jax.Array) -> Any:
+        return self._observe(self.env.reset(rng))
+
+    def step(self, state: Any, action: jax.Array) -> Any:
+        return self._observe(self.env.step(state, action))
+
+    def _observe(self, state: Any) -> Any:
+        return with_fields(state, obs=self.env.baseline(state))
 
 
 def play_gymnasium(stored: StoredPolicy, num_episodes: int, seed: int) -> Results:
