@@ -1,10 +1,16 @@
-"""What the page of a run is given, made up by closed forms: pendulum, arm, comparison."""
+"""What the page of a run is given, made up by closed forms: pendulum, arm, a robot in space, comparison."""
 
 import base64
 from collections.abc import Callable
 from typing import Any
 
+import mujoco
 import numpy as np
+
+from envs.scenes import Scene
+from jaxpg.watch import stage_in_space
+from jaxpg.watch.clips import Clip
+from jaxpg.watch.recording import Look
 
 Json = dict[str, Any]
 INT16 = 2**15 - 1
@@ -149,15 +155,23 @@ def pendulum(**changes: Any) -> Json:
     return document("run", "ppo on pendulum, seed 0", **parts | changes)
 
 
+def tip(upper: float, fore: float) -> list[float]:
+    """Where links at these angles end."""
+    end = LINKS[0] * np.exp(1j * upper) + LINKS[1] * np.exp(1j * fore)
+    return [float(end.real), float(end.imag)]
+
+
+GOALS = [tip(0.6 + 1.9 * number, 1.7 + 1.9 * number) for number in range(3)]
+
+
 def reach(policy: int, number: int) -> Json:
     """Before training it hardly moves; afterwards its joints go to their goal as exponentials."""
     time = np.arange(101) * DT
-    goal_angles = np.array([0.6 + 1.9 * number, 1.1])
+    goal_angles, goal = np.array([0.6 + 1.9 * number, 1.1]), complex(*GOALS[number])
     share = (1 - np.exp(-2 * time)) * (1.0 if policy else 0.1)
     upper, fore = share * goal_angles[0], share * goal_angles.sum()
     elbow = LINKS[0] * np.stack([np.cos(upper), np.sin(upper)], axis=-1)
     tip = elbow + LINKS[1] * np.stack([np.cos(fore), np.sin(fore)], axis=-1)
-    goal = LINKS[0] * np.exp(1j * goal_angles[0]) + LINKS[1] * np.exp(1j * goal_angles.sum())
     distance = np.hypot(tip[:, 0] - goal.real, tip[:, 1] - goal.imag)
     parts = np.stack([rod(0, 0, upper), rod(*elbow.T, fore)], axis=1)
     torques = {f"{name} torque [N m]": 2 * size * np.exp(-2 * time[:-1]) for name, size in JOINTS.items()}
@@ -195,12 +209,70 @@ def arm(**changes: Any) -> Json:
         "player": player,
         "workspace": {
             "title": "success over the workspace",
-            **{"x": "x [m]", "y": "y [m]", "radius": 0.95, "success_radius": 0.05, "points": points},
+            "success_radius": 0.05,
+            "pictures": [
+                {
+                    **{"x": "x [m]", "y": "y [m]", "x_range": [-1.0, 1.0], "y_range": [-1.0, 1.0]},
+                    **{"circle": [0.0, 0.0, 0.95], "points": points, "chosen": [GOALS, GOALS]},
+                }
+            ],
         },
         "configuration": [["env", "arm"]],
         "versions": [["jax", "0.10.1"]],
     }
     return document("run", "ppo on arm, seed 0", **parts | changes)
+
+
+TURNER = """<mujoco><worldbody>
+  <body pos="0 0 .1"><joint axis="0 0 1"/><geom type="box" size=".1 .1 .1" rgba=".8 .2 .2 1"/>
+    <body pos="0 0 .1"><joint axis="0 1 0"/><geom type="box" size=".04 .04 .3" pos="0 0 .3" rgba=".2 .3 .8 1"/>
+      <site name="tip" pos="0 0 .6"/></body></body>
+</worldbody></mujoco>"""
+GOAL_RADIUS = 0.05
+
+
+def turn(policy: int, number: int) -> Clip:
+    """Turns the column and leans the beam; before training half as fast. The goal is at the beam's end, and turned."""
+    time, model = np.arange(61) * DT, mujoco.MjModel.from_xml_string(TURNER)
+    speed = np.array([0.5 + 0.3 * number, 0.4]) * (1.0 if policy else 0.5)
+    data = mujoco.MjData(model)
+    data.qpos = 3.0 * np.array([0.5 + 0.3 * number, 0.4])
+    mujoco.mj_kinematics(model, data)
+    goal, rotation = (np.tile(x[0], (61, 1)) for x in (data.site_xpos, data.site_xmat))
+    look = Look(time[:, None] * speed, goal, None, rotation.reshape(-1, 3, 3))
+    series = {"u [rad/s]": np.full(60, speed[0]), "reward": -np.ones(60), "value": -np.ones(60)}
+    return Clip(look, series, -np.arange(61.0), DT, -60.0, bool(policy))
+
+
+def turner(**changes: Any) -> Json:
+    """The run of a robot in space: a column that turns, with a beam on it that leans; its goal is a pose."""
+    scene = Scene(mujoco.MjModel.from_xml_string(TURNER), None, goal_radius=GOAL_RADIUS, site=0)
+    clips = [[turn(policy, number) for number in range(3)] for policy in range(2)]
+    common, drawn = stage_in_space.make_stage(scene, clips)
+
+    def play(policy: int, number: int) -> Json:
+        clip = clips[policy][number]
+        series = {name: values.tolist() for name, values in clip.series.items()}
+        known = {"return": clip.episode_return, "success": clip.success, "so_far": clip.so_far.tolist()}
+        return known | {"series": series, "path": None} | drawn[policy][number]
+
+    rim = [[0.5 * np.cos(a), 0.5 * np.sin(a), a / 7, 0.01 + 0.05 * (i % 2), 1 - i % 2] for i, a in enumerate(range(20))]
+    above = {"x": "x [m]", "y": "y [m]", "x_range": [-0.6, 0.6], "y_range": [-0.6, 0.6], "circle": [0.0, 0.0, 0.5]}
+    side = {"x": "r [m]", "y": "z [m]", "x_range": [0.0, 0.6], "y_range": [0.0, 3.0], "circle": None}
+    points = [[[x, y, d, s] for x, y, _, d, s in rim]] * 2, [[[0.5, z, d, s] for _, _, z, d, s in rim]] * 2
+    pictures = [
+        one | {"points": rows, "chosen": [[rows[0][i][:2] for i in range(3)]] * 2}
+        for one, rows in zip((above, side), points, strict=True)
+    ]
+    parts = {
+        "curves": [panel("return", curve("deterministic policy", -12.0, 1.0))],
+        "player": {
+            **{"dt": DT, "limits": {"u [rad/s]": 2.0}, "goal_radius": GOAL_RADIUS},
+            **{"series": ["u [rad/s]", "reward", "value"], "policies": policies(play), **common},
+        },
+        "workspace": {"title": "success over the workspace", "success_radius": GOAL_RADIUS, "pictures": pictures},
+    }
+    return document("run", "ppo on turner, seed 0", **parts | changes)
 
 
 def comparison(**changes: Any) -> Json:

@@ -1,5 +1,6 @@
 """Whatever an environment is, its run has a page; what cannot be drawn is left out and said, and bugs are raised."""
 
+import base64
 import json
 import math
 import re
@@ -38,6 +39,7 @@ BARE = """<mujoco><worldbody>
     <body><joint name="hinge" axis="0 -1 0"/><inertial pos="0 0 .3" mass=".1" diaginertia=".003 .003 .0001"/></body>
   </body></worldbody><actuator><motor joint="slide"/><motor joint="hinge"/></actuator></mujoco>"""
 
+SPATIAL = ROBOT.format(more="").replace('axis="0 -1 0"', 'axis="0 0 1"').replace("</body>", "<site/></body>", 1)
 UNKNOWN = "the policy has 1 command, the model 2 actuators: cannot match them"
 
 
@@ -51,7 +53,7 @@ class Odd:
 
     observation_size, action_size, dt = 2, 2, 0.1
     xml, commands, limits = ROBOT.format(more=""), ("force [N]", "torque [N m]"), (5.0, 0.1)
-    metrics, goal, goal_radius = (), None, None
+    metrics, goal, goal_radius, goal_rotation, site = (), None, None, None, None
 
     def __init__(self, config):
         self.config, self.model = config, mujoco.MjModel.from_xml_string(self.xml)
@@ -62,7 +64,8 @@ class Odd:
 
     @property
     def scene(self):
-        return Scene(self.model, self.qpos, self.goal and (lambda state: jnp.array(self.goal)), self.goal_radius)
+        goal, rotation = (x and (lambda state, x=x: jnp.array(x)) for x in (self.goal, self.goal_rotation))
+        return Scene(self.model, self.qpos, goal, self.goal_radius, rotation, self.site)
 
     def qpos(self, state):
         return state.pipeline_state
@@ -128,11 +131,12 @@ def test_limits_of_any_kind_of_numbers(shown, limits):
 
 def test_a_success_that_is_no_number_and_a_goal_without_a_distance(shown):
     data = shown(metrics=("success",), goal=(0.0, 0.0, 0.5), goal_radius=np.float32(0.1))
-    points = data["workspace"]["points"][1]
+    (picture,) = data["workspace"]["pictures"]
+    points = picture["points"][1]
     assert len(points) == 8
     assert {row[2] for row in points} == {None}
     assert {row[3] for row in points} <= {0, 1}
-    assert (data["workspace"]["x"], data["workspace"]["y"]) == ("x [m]", "z [m]")
+    assert (picture["x"], picture["y"]) == ("x [m]", "z [m]")
     assert data["notes"] == []
     assert all(0 <= float(row[2].removesuffix(" %")) <= 100 for row in data["head"]["rows"])
 
@@ -142,6 +146,26 @@ def test_a_robot_without_visible_geoms_is_drawn_all_the_same(shown, xml):
     data = shown(xml=xml)
     assert len(data["player"]["parts"]) == 2
     assert data["notes"] == []
+
+
+def test_a_robot_in_space_with_a_pose_to_reach(shown):
+    turn = ((0.0, -1.0, 0.0), (1.0, 0.0, 0.0), (0.0, 0.0, 1.0))
+    data = shown(xml=SPATIAL, goal=(0.1, 0.2, 0.5), goal_radius=0.1, goal_rotation=turn, site=0, metrics=("success",))
+    assert data["notes"] == []
+    space = data["player"]["space"]
+    assert (len(space["bodies"]), len(space["joints"]), len(space["parts"])) == (2, 2, 2)
+    assert space["site"]["body"] == 2
+    for episode in (one for policy in data["player"]["policies"] for one in policy["episodes"]):
+        assert episode["goals"] == [[0.1, 0.2, 0.5]]  # one row, as it does not move
+        assert episode["turns"] == [np.ravel(turn).tolist()]
+        assert len(np.frombuffer(base64.b64decode(episode["qpos"]), "<i2")) == 2 * episode["frames"]
+    assert [picture["x"] for picture in data["workspace"]["pictures"]] == ["x [m]"]
+
+
+def test_a_robot_in_space_whose_goal_is_no_number(shown):
+    data = shown(xml=SPATIAL, goal=(np.nan, 0.0, 0.0))
+    assert data["notes"] == []
+    assert data["player"]["policies"][0]["episodes"][0]["goals"] is None
 
 
 @pytest.mark.parametrize(
@@ -184,6 +208,11 @@ WRONG = [
         r"no goal: scene.goal\(state\) has the shape \(2,\), expected \(3,\)",
     ),
     ({"goal": (0.0, 0.0, 0.0), "goal_radius": -1.0}, "no goal: scene.goal_radius is -1.0"),
+    (
+        {"goal": (0.0, 0.0, 0.0), "goal_rotation": (1.0, 0.0, 0.0, 0.0), "metrics": ("success",)},
+        r"no goal: scene.goal_rotation\(state\) has the shape \(4,\), expected \(3, 3\)",
+    ),
+    ({"site": 3}, "no picture of the robot: scene.site is 3, the model has 0 sites"),
     ({"phase_plane": plane(ranges=((1.0, 1.0), (0.0, 1.0)))}, "no phase portrait: phase_plane.ranges"),
     ({"phase_plane": plane(coordinates=lambda state: state.reward)}, r"no phase portrait: .*coordinates\(state\) has"),
     ({"phase_plane": plane(observe=fails)}, r"no phase portrait: phase_plane.observe\(x, y\) raises AttributeError"),

@@ -5,12 +5,16 @@ import math
 import re
 
 import browsers
+import mujoco
 import numpy as np
 import pages
 import pytest
-from browsers import frame_of, scrub, seen, stage_pixel
+import scipy.ndimage
+from browsers import frame_of, pixel, scrub, seen, stage_pixel
 
+from jaxpg.watch import raster, solids
 from jaxpg.watch.page import make_page
+from jaxpg.watch.space import make_axes
 
 
 @pytest.fixture(scope="module")
@@ -128,7 +132,7 @@ def test_every_control_is_reached_by_tab_with_a_visible_focus(show):
 
 
 @pytest.mark.parametrize("part", ["#policy label:nth-of-type(1)", "#episode label:nth-of-type(3)", ".ghost"])
-@pytest.mark.parametrize("data", [pages.pendulum, pages.arm])
+@pytest.mark.parametrize("data", [pages.pendulum, pages.arm, pages.turner])
 def test_a_choice_changes_what_is_drawn(show, data, part):
     tab = show(data())
     scrub(tab, 30)
@@ -165,6 +169,126 @@ def test_torques_are_arcs_from_the_top_counter_clockwise_if_positive(show, torqu
         place = 0.09 * 2.5 * 1j * np.exp(1j * np.radians(turn) * np.sign(torque * sign))
         is_drawn = stage_pixel(tab, data, place.real, place.imag) == (194, 78, 0)
         assert is_drawn == (turn < 270 * abs(torque) / 2.0)
+
+
+def looked_at(data, frame, size, azimuth=0.0, elevation=0.0):
+    """The same picture by NumPy: which part each pixel shows, 0 for none, `[H, W]`; its camera; where the site is."""
+    space, model = data["player"]["space"], mujoco.MjModel.from_xml_string(pages.TURNER)
+    axes = make_axes(space["azimuth"] + azimuth, space["elevation"] + elevation)
+    half = math.radians(17.5)
+    eye = np.array(space["center"]) + space["radius"] / math.sin(half) * axes[2]
+    camera = raster.Camera(eye, axes, min(size) / 2 / math.tan(half), size, 0.1)
+    picture = raster.Raster(np.zeros((size[1], size[0], 3)), np.zeros((size[1], size[0])))
+    state = mujoco.MjData(model)
+    state.qpos = frame * pages.DT * np.array([0.5, 0.4])
+    mujoco.mj_kinematics(model, state)
+    for number, part in enumerate(solids.make_parts(model), start=1):
+        placed = part.solid.vertices @ state.xmat[part.body].reshape(3, 3).T + state.xpos[part.body]
+        corners, _ = raster.list_corners(camera, placed, part.solid.triangles)
+        raster.paint(picture, corners, np.ones((len(corners), 3)), np.full((len(corners), 3), number / 2))
+    return np.rint(2 * picture.color[..., 0]).astype(int), camera, state.site_xpos[0]
+
+
+def assert_shows(tab, data, frame, azimuth=0.0, elevation=0.0):
+    """The stage shows the red column and the blue beam where they are; edges and axes are not looked at."""
+    box = tab.locator("#stage").bounding_box()
+    size = round(box["width"]) - 2, round(box["height"]) - 2
+    parts, camera, tip = looked_at(data, frame, size, azimuth, elevation)
+    goal = data["player"]["policies"][1]["episodes"][0]["goals"][0]
+    rows, columns = np.indices(parts.shape)
+    sure = scipy.ndimage.minimum_filter(parts, 7) == scipy.ndimage.maximum_filter(parts, 7)
+    for x, y, _ in raster.project(camera, np.array([goal, tip])):
+        sure &= np.hypot(columns - x, rows - y) > 90
+    rng = np.random.default_rng(frame)
+    for part in (1, 2):
+        places = np.argwhere(sure & (parts == part))
+        assert len(places) > 200
+        for row, column in rng.choice(places, 12):
+            red, _, blue = pixel(tab, "#stage", (column + 1) / size[0], (row + 1) / size[1])
+            assert (red > 1.5 * blue, blue > 1.5 * red) == (part == 1, part == 2)
+
+
+def test_a_robot_in_space_is_drawn_where_it_is_and_what_is_nearer_hides_what_is_farther(show):
+    data = pages.turner()
+    tab = show(data)
+    for frame in (0, 25, 60):
+        scrub(tab, frame)
+        assert_shows(tab, data, frame)
+
+
+def test_dragging_turns_the_robot_and_does_not_play(show):
+    """Half a degree for each pixel: to the right its front goes to the right, down one looks from above."""
+    data = pages.turner()
+    tab = show(data)
+    scrub(tab, 25)
+    box = tab.locator("#stage").bounding_box()
+    tab.mouse.move(box["x"] + 300, box["y"] + 200)
+    tab.mouse.down()
+    for step in range(1, 5):
+        tab.mouse.move(box["x"] + 300 - 30 * step, box["y"] + 200 + 15 * step)
+    tab.mouse.up()
+    assert tab.get_attribute("#play", "aria-label") == "play"
+    assert_shows(tab, data, 25, azimuth=60, elevation=-30)
+    tab.mouse.click(box["x"] + 300, box["y"] + 200)
+    assert tab.get_attribute("#play", "aria-label") == "pause"
+    assert tab.eval_on_selector("#stage", "(e) => getComputedStyle(e).touchAction") == "pan-y"  # a finger can scroll
+
+
+def test_a_key_changes_from_where_it_is_seen(show):
+    data = pages.turner()
+    tab = show(data)
+    scrub(tab, 25)
+    first = {name: data["player"]["space"][name] for name in ("azimuth", "elevation")}
+    for azimuth, elevation in [(90, 0), (180, 0), (90, -89.9), tuple(first.values())]:
+        tab.keyboard.press("v")
+        assert_shows(tab, data, 25, azimuth - first["azimuth"], elevation - first["elevation"])
+    tab.keyboard.press("Control+v")  # pastes
+    assert_shows(tab, data, 25)
+
+
+def test_a_goal_that_is_turned_is_drawn_with_its_axes(show):
+    """Red, green and blue are x, y and z; looked for half way along them, from where the robot hides none."""
+    data = pages.turner()
+    tab = show(data)
+    scrub(tab, 0)
+    box = tab.locator("#stage").bounding_box()
+    size = round(box["width"]) - 2, round(box["height"]) - 2
+    parts, camera, _ = looked_at(data, 0, size)
+    episode = data["player"]["policies"][1]["episodes"][0]
+    place, turn = np.array(episode["goals"][0]), np.reshape(episode["turns"][0], (3, 3))
+    for axis in range(3):
+        x, y, _ = raster.project(camera, place + 0.75 * 3 * pages.GOAL_RADIUS * turn[:, axis])
+        assert parts[round(y), round(x)] == 0
+        colours = np.array([pixel(tab, "#stage", (x + dx) / size[0], (y + dy) / size[1]) for dx, dy in NEARBY])
+        assert (np.argmax(colours, axis=1) == axis).any()
+
+
+NEARBY = [(x, y) for x in (0, 1, 2) for y in (0, 1, 2)]
+
+
+def test_a_robot_that_runs_is_followed(show):
+    """The column on a base that goes 50 m: it is in the middle of the picture at the end as at the beginning."""
+    data = pages.turner()
+    space = data["player"]["space"]
+    for body in space["bodies"]:
+        body["parent"] += 1
+    moving = {"kind": "slide", "body": 1, "first": 2, "position": [0, 0, 0], "axis": [1, 0, 0], "reference": 0}
+    space["bodies"].insert(0, {"parent": 0, "position": [0, 0, 0], "turn": [1, 0, 0, 0]})
+    for one in (*space["joints"], *space["parts"], space["site"]):
+        one["body"] += 1
+    space["joints"].append(moving)
+    for episode in (one for policy in data["player"]["policies"] for one in policy["episodes"]):
+        path = np.linspace(0, pages.INT16, episode["frames"])
+        qpos = np.zeros((episode["frames"], 3))
+        qpos[:, 2] = path
+        episode |= {"qpos": pages.packed(qpos), "units": [1.0, 1.0, 50 / pages.INT16], "goals": None, "turns": None}
+        shifts = np.column_stack([path, 0 * path])
+        episode |= {"shifts": pages.packed(shifts), "shift_units": [50 / pages.INT16, 1.0]}
+    tab = show(data)
+    for frame in (0, 30, 60):
+        scrub(tab, frame)
+        data_at_rest = {"player": {**data["player"], "policies": [None, {"episodes": [{"goals": [[9, 9, 9]]}]}]}}
+        assert_shows(tab, data_at_rest, 0)
 
 
 def test_a_box_is_drawn_with_its_corners(show):
@@ -230,6 +354,21 @@ def test_the_workspace_counts_what_it_draws(show):
         assert tab.locator(".workspace .success").count() == reached
         assert tab.locator(".workspace .failure").count() == 120 - reached
         assert f"{reached} of 120" in tab.inner_text(".counts .strong")
+
+
+def test_the_workspace_of_a_robot_in_space_is_seen_from_above_and_from_the_side(show):
+    """Side by side; every goal is in both; a metre is as long in all directions."""
+    data = pages.turner()
+    tab = show(data)
+    pictures = tab.locator(".workspace svg")
+    assert [pictures.nth(i).locator(".success").count() for i in range(2)] == [10, 10]
+    assert [pictures.nth(i).locator(".failure").count() for i in range(2)] == [10, 10]
+    boxes = [pictures.nth(i).bounding_box() for i in range(2)]
+    assert boxes[0]["y"] == boxes[1]["y"]
+    assert boxes[0]["x"] + boxes[0]["width"] <= boxes[1]["x"]
+    circle = pictures.nth(0).locator(".limit").bounding_box()
+    assert circle["width"] == pytest.approx(circle["height"], rel=0.02)
+    assert "10 of 20" in tab.inner_text(".counts .strong")
 
 
 def test_curves_are_read_by_keyboard_and_by_pointing(show):
@@ -326,7 +465,7 @@ def test_paper_is_white_and_the_screen_stays_dark(show):
     assert seen(tab, "#stage") == before
 
 
-@pytest.mark.parametrize("data", [pages.pendulum, pages.arm, pages.comparison])
+@pytest.mark.parametrize("data", [pages.pendulum, pages.arm, pages.turner, pages.comparison])
 def test_the_page_never_scrolls_sideways(show, data):
     tab = show(data())
     tab.eval_on_selector_all("details", "(all) => all.forEach((one) => { one.open = true; })")
@@ -366,7 +505,7 @@ def test_texts_are_never_read_as_html(show):
     for policy in data["player"]["policies"]:
         policy["label"] = policy["note"] = nasty
     data["tables"][0]["rows"][0][0] = data["improvement"]["labels"][0] = data["curves"][0]["title"] = nasty
-    data["workspace"]["title"] = data["workspace"]["x"] = data["curves"][0]["series"][0]["label"] = nasty
+    data["workspace"]["title"] = data["workspace"]["pictures"][0]["x"] = data["curves"][0]["series"][0]["label"] = nasty
     tab = show(data)
     assert tab.locator("img, script").count() == 2
     assert tab.locator(".facts dd").text_content() == nasty

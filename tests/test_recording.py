@@ -2,11 +2,13 @@
 
 import jax
 import jax.numpy as jnp
+import mujoco
 import numpy as np
 import pytest
 from stored import a_policy
 
 from envs.pendulum import observe
+from envs.reach import Reach, ReachConfig
 from envs.scenes import find_scene
 from jaxpg import normalization
 from jaxpg.evaluation import evaluate
@@ -16,8 +18,9 @@ from jaxpg.program.state import make_initial_run
 from jaxpg.watch import drawing
 from jaxpg.watch.clips import make_clip
 from jaxpg.watch.player import wrap_coordinates
-from jaxpg.watch.recording import compute_value_map, record
+from jaxpg.watch.recording import compute_value_map, make_look, record
 from jaxpg.watch.untrained import make_untrained
+from jaxpg.watch.view import find_view
 
 STARTS = 5
 PENDULUM = ("env=pendulum", "network.widths=[8]", "env.episode_length=40", "num_envs=2", "algo.num_shards=1")
@@ -110,6 +113,22 @@ def test_the_policy_before_training_is_the_one_that_training_begins_with():
     assert largest_difference(found.policy.params, same.params) < 1e-6
     assert largest_difference(found.policy.params, other.params) > 0.01
     assert largest_difference(found.policy.normalizer, same.normalizer) == 0
+
+
+def test_a_pose_to_reach_is_drawn_as_the_environment_measures_it():
+    """The angle of R_g R^T from what is drawn, the goal's rotation and the site's, is the environment's error."""
+    env = Reach(ReachConfig(goal="pose", physics="mujoco"))
+    scene, look = find_scene(env), make_look(find_view(env))
+    for seed in range(3):
+        state = env.reset(jax.random.key(seed))
+        seen, errors, data = look(state), env.find_errors(state.pipeline_state), mujoco.MjData(scene.model)
+        data.qpos = seen.qpos
+        mujoco.mj_kinematics(scene.model, data)
+        left = seen.rotation @ data.site_xmat[scene.site].reshape(3, 3).T
+        assert np.arccos((np.trace(left) - 1) / 2) == pytest.approx(float(errors.angle), abs=1e-3)
+        distance = np.linalg.norm(seen.goal - data.site_xpos[scene.site])
+        assert distance == pytest.approx(float(errors.distance), abs=1e-4)
+    assert find_scene(Reach(ReachConfig(physics="mujoco"))).goal_rotation is None
 
 
 # --- in the plane -----------------------------------------------------------------------------------------------------

@@ -14,13 +14,15 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from PIL import Image, ImageSequence
+from spatial import ARM as ARM_IN_SPACE
+from spatial import RUNNER
 from stored import a_policy
 
 from envs.options import OptionError
 from envs.scenes import find_scene
 from jaxpg import render as command_line
 from jaxpg.errors import UserError
-from jaxpg.watch import gl, movie, video
+from jaxpg.watch import gl, movie, raster, sketch, solids, space, video
 from jaxpg.watch.clips import Clip
 from jaxpg.watch.recording import Look
 
@@ -52,6 +54,11 @@ def test_what_the_user_asks_for_comes_before_egl_and_that_before_osmesa(asked, t
     assert attempts == tried
 
 
+def test_where_there_is_no_opengl_none_is_found():
+    assert gl.find_backend({}, lambda name: False, "linux") is None
+    assert gl.find_backend({"MUJOCO_GL": " "}, lambda name: False, "darwin") is None
+
+
 def test_a_mac_has_a_backend_of_its_own():
     assert gl.find_backend({}, lambda name: name == "", "darwin") == ""
 
@@ -59,13 +66,12 @@ def test_a_mac_has_a_backend_of_its_own():
 @pytest.mark.parametrize(
     ("asked", "message"),
     [
-        ("", "neither EGL nor OSMesa: apt-get install libegl1 libgl1-mesa-dri or apt-get install libosmesa6$"),
         ("egl", "^MUJOCO_GL=egl: .*; apt-get install libegl1 libgl1-mesa-dri, or unset it$"),
         ("osmesa", "^MUJOCO_GL=osmesa: .*; apt-get install libosmesa6, or unset it$"),
         ("glfw", "^MUJOCO_GL=glfw: .*here; unset it$"),
     ],
 )
-def test_where_there_is_no_opengl_the_line_says_what_to_install(asked, message):
+def test_where_what_the_user_asks_for_fails_the_line_says_what_to_install(asked, message):
     with pytest.raises(UserError, match=message):
         gl.find_backend({"MUJOCO_GL": asked}, lambda name: False, "linux")
 
@@ -81,9 +87,10 @@ def test_a_backend_that_fails_fails_elsewhere():
 @pytest.fixture(scope="module")
 def backend():
     try:
-        return gl.find_backend(os.environ, gl.is_working)
+        found = gl.find_backend(os.environ, gl.is_working)
     except UserError as error:
         pytest.skip(str(error))
+    return pytest.skip("needs OpenGL: apt-get install libegl1 libgl1-mesa-dri") if found is None else found
 
 
 @pytest.fixture(scope="module")
@@ -150,6 +157,77 @@ def test_a_robot_without_visible_geoms_is_seen_all_the_same(geoms, backend):
         image = canvas.draw([Cell(np.zeros(1), None, np.zeros(0), "")]).astype(int)
     middle = image[SIZE // 2 - 5 : SIZE // 2 + 5, SIZE // 2 - 5 : SIZE // 2 + 5]
     assert changed(middle, np.broadcast_to(image[5, 5], middle.shape)).all()
+
+
+def in_space(camera="", size=SIZE):
+    """The robot in space, two of its poses, its framing, and where the camera sees a point: column and row."""
+    model = mujoco.MjModel.from_xml_string(ARM_IN_SPACE.replace("<worldbody>", f"<worldbody>{camera}"))
+    parts, qpos = solids.make_parts(model), np.array([[0.3, 0.4], [2.0, 1.0]])
+    framing = space.make_framing(model, parts, [Look(qpos, np.tile([[0.4, 0.2, 0.9]], (2, 1)), None)])
+    data = mujoco.MjData(model)
+    mujoco.mj_forward(model, data)
+    return model, qpos, framing, sketch.make_camera(model, data, framing, np.zeros(3), (size, size))
+
+
+@pytest.fixture(params=["OpenGL", "no OpenGL"])
+def draw_in_space(request):
+    """`draw_in_space(model, framing, cell)`: a picture by MuJoCo's renderer, or without it."""
+
+    def drawn(model, framing, cell, size=SIZE):
+        if request.param == "no OpenGL":
+            with sketch.Sketch(model, (1, 1), (size, size), 0.1, 0, framing) as tool:
+                return tool.draw([cell]).astype(int)
+        from jaxpg.watch.canvas import Canvas
+
+        found = request.getfixturevalue("backend")
+        with Canvas(model, found, (1, 1), (size, size), 0.1, 0, framing) as tool:
+            return tool.draw([cell]).astype(int)
+
+    return drawn
+
+
+@pytest.mark.parametrize("camera", ["", '<camera pos="0 -3 .5" xyaxes="1 0 0 0 0 1" fovy="50"/>'])
+def test_in_space_the_goal_is_where_the_camera_sees_it(draw_in_space, camera):
+    """Beside the robot; a ball of 0.1 m, of which some may be below the floor."""
+    from jaxpg.watch.canvas import Cell
+
+    model, qpos, framing, seen_from = in_space(camera)
+    goal, still = np.array([0.4, 0.2, 0.9]), (qpos[1], None, np.zeros(0), "")
+    without = draw_in_space(model, framing, Cell(*still))
+    mask = changed(draw_in_space(model, framing, Cell(qpos[1], goal, np.zeros(0), "")), without)
+    x, y, depth = raster.project(seen_from, goal)
+    np.testing.assert_allclose(where(mask).mean(axis=0), [x - 0.5, y - 0.5], atol=1.0)
+    assert math.sqrt(mask.sum() / math.pi) == pytest.approx(0.1 * seen_from.focal / depth, rel=0.1)
+
+
+def test_in_space_a_goal_that_is_turned_has_axes_in_the_colours_of_x_y_and_z(draw_in_space):
+    from jaxpg.watch.canvas import Cell
+
+    model, qpos, framing, seen_from = in_space(size=480)
+    goal, turn = np.array([0.25, 0.0, 0.5]), np.eye(3)[:, [1, 2, 0]]
+    cells = (Cell(qpos[1], goal, np.zeros(0), "", rotation) for rotation in (None, turn))
+    plain, turned = (draw_in_space(model, framing, cell, size=480) for cell in cells)
+    for axis in range(3):
+        x, y, _ = np.rint(raster.project(seen_from, goal + 0.26 * turn[:, axis])).astype(int)  # of 0.3 m
+        near = (slice(y - 2, y + 2), slice(x - 2, x + 2))
+        new = (turned - plain)[near][changed(turned[near], plain[near])]  # also where it is seen through the ball
+        assert len(new) > 0
+        assert (np.argmax(new, axis=1) == axis).mean() > 0.7
+
+
+def test_a_robot_that_runs_stays_in_the_middle_of_its_video(draw_in_space):
+    """On the same place relative to the camera: the pictures differ only in what is on the ground."""
+    from jaxpg.watch.canvas import Cell
+
+    model = mujoco.MjModel.from_xml_string(RUNNER.replace('<geom type="box" size="1 1 .1" pos="9 9 9"/>', ""))
+    parts, qpos = solids.make_parts(model), np.tile(model.qpos0, (3, 1))
+    qpos[:, 0] = [0.0, 10.0, 20.0]  # whole meshes of the grid
+    framing = space.make_framing(model, parts, [Look(qpos, None, None)])
+    shifts = space.find_shifts(model, parts, qpos, framing)
+    first, last = (draw_in_space(model, framing, Cell(qpos[i], None, np.zeros(0), "", None, shifts[i])) for i in (0, 2))
+    assert changed(first, last).mean() < 0.02
+    lost = draw_in_space(model, framing, Cell(qpos[2], None, np.zeros(0), ""))
+    assert changed(first, lost).mean() > 0.05
 
 
 @pytest.mark.parametrize("theta", [0.0, 1.0, -2.2])
@@ -356,6 +434,20 @@ def test_episodes_of_a_run_become_a_video(run, backend, capsys):
     assert frames[0].shape == (2 * 48, 2 * 64, 3)
     assert sum(times) == pytest.approx(0.8)
     assert names(run) == {"config.yaml", "three.gif"}
+
+
+def test_without_opengl_the_video_is_drawn_all_the_same(run, monkeypatch, capsys):
+    monkeypatch.setattr(gl, "find_backend", lambda *_: None)
+    out = run / "three.gif"
+    assert command_line.main([f"run={run}", f"out={out}", "episodes=3", "width=128", "height=96", "speed=0.5"]) == 0
+    note, *_, last = capsys.readouterr().out.splitlines()
+    assert note.startswith("note: there is no OpenGL, so the video is drawn in a simpler way; ")
+    assert last == f"{out}  8 pictures, 0.80 s at 10 a second"
+    frames, _ = read(out)
+    assert frames[0].shape == (2 * 96, 2 * 128, 3)
+    rods = [frame[:96, 128:255, 0].astype(int) - frame[:96, 128:255, 2] > 60 for frame in frames]
+    assert min(rod.sum() for rod in rods) > 30
+    assert (rods[0] != rods[-1]).any()  # it moves
 
 
 @pytest.mark.parametrize(

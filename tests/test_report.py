@@ -115,12 +115,14 @@ def test_the_portrait_has_a_map_for_each_policy(run):
 def test_the_workspace_counts_as_the_evaluation_does(run):
     folder, _, data = run("arm")
     lines = read_metrics(RunFolder(folder))
-    points = np.array(data["workspace"]["points"][1])
+    (picture,) = data["workspace"]["pictures"]
+    points = np.array(picture["points"][1])
     assert points.shape == (4, 4)
     assert points[:, 3].mean() == pytest.approx(max(lines, key=lambda line: line["eval_return"])["eval_success"])
     assert ((points[:, 2] < data["workspace"]["success_radius"]) == (points[:, 3] > 0)).all()
     goals = [episode["goal"] for episode in data["player"]["policies"][0]["episodes"]]
     np.testing.assert_allclose(goals, points[:, :2])
+    np.testing.assert_allclose(picture["chosen"][0], goals, rtol=1e-3)
     assert data["portrait"] is None
 
 

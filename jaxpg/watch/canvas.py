@@ -12,16 +12,23 @@ import mujoco
 import numpy as np
 
 from jaxpg.watch import gl
-from jaxpg.watch.drawing import find_geoms
+from jaxpg.watch.drawing import find_camera, find_geoms
+from jaxpg.watch.marks import DOT, add_geom, connect, draw_bones, draw_goal, draw_grid, list_frames
+from jaxpg.watch.solids import find_bones, find_color
+from jaxpg.watch.space import Framing, make_axes
 
-GOAL = (0.1, 0.6, 0.25, 0.5)
-DOT = 0.02  # radius of a goal that has none, as a fraction of the model's size
 POSITIVE = (0.95, 0.55, 0.05, 1.0)  # efforts: right-handed about the axis, or along it
 NEGATIVE = (0.55, 0.25, 0.75, 1.0)
 FULL_SWEEP = 1.5 * math.pi  # of an arc at effort 1 [rad]
 MIN_EFFORT = 0.02  # smaller efforts are not drawn
 ARC_STEP = math.pi / 12  # between two points of an arc [rad]
 ARC, THICK, FRONT = 0.5, 0.07, 0.2  # an arc's radius, width and distance from its joint, times the model's mean size
+BACKDROP, GRID = (
+    (0.95, 0.96, 0.98),
+    (0.8, 0.83, 0.87, 1.0),
+)  # behind models without a sky, and below those without a floor
+HEADLIGHT = (0.3, 0.6)  # ambient and diffuse, for models without lights
+GLOW = 100.0  # a material that shines this many times its colour looks the same in all lights
 BORDER, EMPTY = 255, (0.5, 0.5, 0.5, 1.0)  # colours between the pictures and of empty places of the grid
 
 
@@ -33,33 +40,48 @@ class Cell(NamedTuple):
       goal: position of the goal, `[3]` [m], or None.
       efforts: the command of each actuator as a fraction of its limit, `[nu]`.
       caption: a line of text.
+      rotation: orientation of the goal, `[3, 3]`, or None.
+      shift: what is added to the framing's centre, `[3]` [m], or None.
     """
 
     qpos: np.ndarray
     goal: np.ndarray | None
     efforts: np.ndarray
     caption: str
+    rotation: np.ndarray | None = None
+    shift: np.ndarray | None = None
 
 
 class Canvas:
     """Draws pictures side by side into one image; a context manager, which frees its OpenGL context.
 
     Args:
-      model: `mujoco.MjModel`, seen by its first camera, or like in MuJoCo's viewer at its start.
+      model: `mujoco.MjModel`, seen by the camera of `drawing.find_camera` if it has one.
       backend: from `gl.find_backend`.
       grid: number of rows and columns.
       size: width and height of one picture [pixels].
       goal_radius: radius of the sphere that marks the goal [m].
+      site: index of the site whose frame should become the goal's.
+      framing: how a model without a camera is seen; None: like in MuJoCo's viewer at its start.
     """
 
     def __init__(
-        self, model: Any, backend: str, grid: tuple[int, int], size: tuple[int, int], goal_radius: float | None = None
+        self,
+        model: Any,
+        backend: str,
+        grid: tuple[int, int],
+        size: tuple[int, int],
+        goal_radius: float | None = None,
+        site: int | None = None,
+        framing: Framing | None = None,
     ):
+        self._fixed, self._framing, self._site = find_camera(model), framing, site
+        self._fovy = float(model.vis.global_.fovy)
         (self.rows, self.columns), (width, height) = grid, size
         self._width, self._height, self._goal_radius = width, height, goal_radius
         self._model = _prepare(model, self.columns * width, self.rows * height, height / width)
         self._data = mujoco.MjData(self._model)
-        self._motors = _find_motors(self._model)
+        self._motors, self._bones = find_motors(self._model), find_bones(self._model)
         self._gl = gl.make_context(backend, self.columns * width, self.rows * height)
         self._scene, self._options = mujoco.MjvScene(self._model, maxgeom=10_000), _make_options(self._model)
         self._scene.flags[mujoco.mjtRndFlag.mjRND_SHADOW] = False  # on a CPU they would take most of the time
@@ -98,21 +120,58 @@ class Canvas:
         data.qpos = cell.qpos
         mujoco.mj_fwdPosition(model, data)
         everything = mujoco.mjtCatBit.mjCAT_ALL.value
-        mujoco.mjv_updateScene(model, data, self._options, None, _make_camera(model), everything, scene)
+        mujoco.mjv_updateScene(model, data, self._options, None, self._make_camera(cell.shift), everything, scene)
+        draw_bones(scene, data, self._bones)
+        if self._fixed is None and self._framing is not None:
+            self._draw_surroundings(self._framing, cell.shift)
         if cell.goal is not None:
-            radius = self._goal_radius or DOT * model.stat.extent
-            _add_geom(scene, mujoco.mjtGeom.mjGEOM_SPHERE, cell.goal, radius, GOAL)
+            radius = self._goal_radius or DOT * float(model.stat.extent)
+            size = self._framing.radius if self._framing is not None else float(model.stat.extent)
+            draw_goal(scene, cell.goal, radius, list_frames(data, cell.goal, cell.rotation, self._site, size, radius))
         for motor in self._motors:
             _draw_effort(scene, model, data, motor, float(np.clip(cell.efforts[motor], -1, 1)))
         mujoco.mjr_render(place, scene, self._context)
+        if not cell.caption:
+            return
         font, corner = mujoco.mjtFont.mjFONT_NORMAL, mujoco.mjtGridPos.mjGRID_TOPLEFT
         mujoco.mjr_overlay(font, corner, place, cell.caption, "", self._context)
+
+    def _make_camera(self, shift: np.ndarray | None) -> Any:
+        camera = mujoco.MjvCamera()
+        mujoco.mjv_defaultFreeCamera(self._model, camera)
+        if self._fixed is not None:
+            camera.type, camera.fixedcamid = mujoco.mjtCamera.mjCAMERA_FIXED, self._fixed
+        elif self._framing is not None:
+            framing = self._framing
+            camera.lookat[:] = framing.center + (0.0 if shift is None else shift)
+            camera.distance = framing.radius / math.sin(math.radians(self._fovy) / 2)
+            camera.azimuth, camera.elevation = framing.azimuth, framing.elevation
+        return camera
+
+    def _draw_surroundings(self, framing: Framing, shift: np.ndarray | None) -> None:
+        """Something light behind a model without a sky, and a grid below one without a floor."""
+        model, scene, center = self._model, self._scene, framing.center + (0.0 if shift is None else shift)
+        if not np.any(model.tex_type == mujoco.mjtTexture.mjTEXTURE_SKYBOX):
+            axes, distance = make_axes(framing.azimuth, framing.elevation), 4 * framing.radius
+            geom = add_geom(
+                scene, mujoco.mjtGeom.mjGEOM_BOX, center - distance * axes[2], 0.0, (*np.array(BACKDROP) / GLOW, 1.0)
+            )
+            if geom is not None:
+                geom.size[:] = 20 * distance, 20 * distance, 0.01 * distance
+                geom.mat[:] = axes.T
+                geom.emission, geom.specular = GLOW, 0.0
+        if not np.any(model.geom_type == mujoco.mjtGeom.mjGEOM_PLANE):
+            draw_grid(scene, framing, center, GRID)
 
 
 def _prepare(model: Any, width: int, height: int, ratio: float) -> Any:
     """A copy for images of this size; the field of view is widened if the pictures are upright (ratio above 1)."""
     model = copy.copy(model)
     model.vis.quality.numslices = 16  # of round shapes: enough for small pictures, and faster
+    if model.nlight == 0:  # the viewer's own is weak
+        model.vis.headlight.ambient[:], model.vis.headlight.diffuse[:] = HEADLIGHT
+    for geom in find_geoms(model):
+        model.geom_rgba[geom] = find_color(model, geom)
     model.vis.global_.offwidth, model.vis.global_.offheight = width, height
     if ratio > 1:
         model.vis.global_.fovy = _widen(model.vis.global_.fovy, ratio)
@@ -132,15 +191,7 @@ def _widen(fovy: Any, ratio: float) -> Any:
     return 2 * np.rad2deg(np.arctan(ratio * np.tan(np.deg2rad(fovy) / 2)))
 
 
-def _make_camera(model: Any) -> Any:
-    camera = mujoco.MjvCamera()
-    mujoco.mjv_defaultFreeCamera(model, camera)
-    if model.ncam:
-        camera.type, camera.fixedcamid = mujoco.mjtCamera.mjCAMERA_FIXED, 0
-    return camera
-
-
-def _find_motors(model: Any) -> list[int]:
+def find_motors(model: Any) -> list[int]:
     """The actuators of a hinge or a slide joint."""
     kinds = (int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_SLIDE))
     of_joints = [i for i, kind in enumerate(model.actuator_trntype) if kind == mujoco.mjtTrn.mjTRN_JOINT]
@@ -149,19 +200,37 @@ def _find_motors(model: Any) -> list[int]:
 
 def _draw_effort(scene: Any, model: Any, data: Any, motor: int, effort: float) -> None:
     """Draws an arc about a hinge or an arrow along a slide, with its length proportional to the effort."""
-    if not abs(effort) > MIN_EFFORT:  # also skips NaN
-        return
+    eye, top = (np.mean([getattr(scene.camera[i], name) for i in range(2)], axis=0) for name in ("pos", "up"))
+    points = effort_points(model, data, motor, effort, eye, top)
+    if points is not None:
+        _draw_line(scene, points, THICK * model.stat.meansize, effort_color(effort), eye)
+
+
+def effort_color(effort: float) -> tuple[float, ...]:
+    """Red, green, blue and opacity of an effort: amber where it is positive, violet where it is negative."""
+    return POSITIVE if effort > 0 else NEGATIVE
+
+
+def effort_points(
+    model: Any, data: Any, motor: int, effort: float, eye: np.ndarray, top: np.ndarray
+) -> np.ndarray | None:
+    """Points of the arc or arrow of an effort in [-1, 1], `[K, 3]`; None if it is too small, or NaN.
+
+    Args:
+      model, data: the robot, in its pose.
+      motor: index of the actuator, of a hinge or a slide.
+      effort: its command as a fraction of the limit.
+      eye, top: place and upwards direction of the camera.
+    """
+    if not abs(effort) > MIN_EFFORT:
+        return None
     joint, size = model.actuator_trnid[motor, 0], model.stat.meansize
-    origin, axis, color = data.xanchor[joint], data.xaxis[joint], POSITIVE if effort > 0 else NEGATIVE
-    eye = np.mean([scene.camera[i].pos for i in range(2)], axis=0)
+    origin, axis = data.xanchor[joint], data.xaxis[joint]
     if model.jnt_type[joint] == mujoco.mjtJoint.mjJNT_SLIDE:
-        points = np.stack([origin, origin + effort * size * axis])
-    else:
-        # Starts at the top, as on a clock, in front of the turning part.
-        top = np.mean([scene.camera[i].up for i in range(2)], axis=0)
-        front = origin + FRONT * size * math.copysign(1.0, (eye - origin) @ axis) * axis
-        points = arc_points(front, axis, top, ARC * size, effort * FULL_SWEEP)
-    _draw_line(scene, points, THICK * size, color, eye)
+        return np.stack([origin, origin + effort * size * axis])
+    # Starts at the top, as on a clock, in front of the turning part.
+    front = origin + FRONT * size * math.copysign(1.0, (eye - origin) @ axis) * axis
+    return arc_points(front, axis, top, ARC * size, effort * FULL_SWEEP)
 
 
 def arc_points(center: np.ndarray, axis: np.ndarray, top: np.ndarray, radius: float, turn: float) -> np.ndarray:
@@ -190,16 +259,4 @@ def _draw_line(scene: Any, points: np.ndarray, width: float, color: tuple[float,
     sideways /= max(np.linalg.norm(sideways), 1e-9)
     barbs = [points[-1] + head * (sign * sideways - forward) for sign in (-1, 1)]
     for start, end in [*itertools.pairwise(points), *((points[-1], barb) for barb in barbs)]:
-        geom = _add_geom(scene, mujoco.mjtGeom.mjGEOM_CAPSULE, start, 0.0, color)
-        if geom is not None:
-            mujoco.mjv_connector(geom, mujoco.mjtGeom.mjGEOM_CAPSULE, width / 2, start, end)
-
-
-def _add_geom(scene: Any, kind: Any, place: np.ndarray, radius: float, color: tuple[float, ...]) -> Any:
-    """Adds a shape to the scene; returns None if the scene is full."""
-    if scene.ngeom >= scene.maxgeom:
-        return None
-    geom = scene.geoms[scene.ngeom]
-    scene.ngeom += 1
-    mujoco.mjv_initGeom(geom, kind, np.array([radius, 0, 0]), place, np.eye(3).ravel(), np.array(color, np.float32))
-    return geom
+        connect(scene, mujoco.mjtGeom.mjGEOM_CAPSULE, start, end, width / 2, color)

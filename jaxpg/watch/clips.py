@@ -75,6 +75,13 @@ def find_limits(stored: StoredPolicy) -> np.ndarray:
     return np.ones(stored.env.action_size) if limits is None else np.asarray(limits, float)
 
 
+def list_limits(stored: StoredPolicy) -> dict[str, float]:
+    """The limit of each command, by name; empty if there are none."""
+    if stored.interface.limits is None:
+        return {}
+    return dict(zip(find_command_names(stored), find_limits(stored).tolist(), strict=True))
+
+
 def frame_steps(last: int, interval: int) -> list[int]:
     """The steps that are shown: every `interval`-th from 0 on, and always the last one.
 

@@ -17,6 +17,7 @@ from jaxpg.watch.attempts import DrawingError
 SIDE = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])  # for models without a camera
 TRAVEL = 4.0  # a robot that travels this many times its own size is kept in the middle
 MAX_REACH = 20.0  # times the model's size: anything farther away is drawn there
+PARALLEL = 0.9  # cosine of the angle between an axis and the line of sight above which they count as parallel
 CIRCLE_POINTS = 16
 NUM_DIRECTIONS = 64  # in which the outermost points of a mesh or an ellipsoid are searched
 BODY_COLOR = "#9aa5b3"  # for bodies, in models without geoms
@@ -101,9 +102,7 @@ def make_picture(model: Any) -> Picture:
     mujoco.mj_kinematics(model, data)
     mujoco.mj_comPos(model, data)
     geoms = find_geoms(model)
-    parts = [Part(i, *_make_outline(model, i), _format_color(_find_rgba(model, i))) for i in geoms] or _make_bodies(
-        model
-    )
+    parts = [Part(i, *make_outline(model, i), format_color(find_rgba(model, i))) for i in geoms] or make_bodies(model)
     if not parts:
         raise DrawingError("the model has no geoms and no bodies")
     depth = (data.geom_xpos if geoms else data.xipos) @ axes[2]
@@ -114,11 +113,11 @@ def make_picture(model: Any) -> Picture:
 def find_geoms(model: Any) -> list[int]:
     """The visible geoms, or all if none is visible; without planes and height fields."""
     unbounded = (mujoco.mjtGeom.mjGEOM_PLANE, mujoco.mjtGeom.mjGEOM_HFIELD)
-    geoms = [i for i in np.flatnonzero(~np.isin(model.geom_type, unbounded)).tolist() if _find_rgba(model, i)[3]]
+    geoms = [i for i in np.flatnonzero(~np.isin(model.geom_type, unbounded)).tolist() if find_rgba(model, i)[3]]
     return [i for i in geoms if model.geom_group[i] < 3] or geoms
 
 
-def _make_outline(model: Any, geom: int) -> tuple[np.ndarray, float]:
+def make_outline(model: Any, geom: int) -> tuple[np.ndarray, float]:
     """Points `[K, 3]` in the geom's frame, and the radius around them."""
     kind, size = model.geom_type[geom], model.geom_size[geom]
     if kind == mujoco.mjtGeom.mjGEOM_SPHERE:
@@ -152,7 +151,7 @@ def _find_outermost(model: Any, mesh: int) -> np.ndarray:
     return vertices[np.unique(np.argmax(vertices @ _make_directions().T, axis=0))].astype(float)
 
 
-def _make_bodies(model: Any) -> list[Part]:
+def make_bodies(model: Any) -> list[Part]:
     """Boxes of uniform density with the mass and inertia of the bodies, as in MuJoCo's viewer.
 
     A box with half sides a, b, c has I_x = m (b^2 + c^2) / 3, so a = sqrt(3 (I_y + I_z - I_x) / (2 m))
@@ -165,22 +164,44 @@ def _make_bodies(model: Any) -> list[Part]:
     return parts
 
 
-def _format_color(rgba: np.ndarray) -> str:
+def format_color(rgba: np.ndarray) -> str:
+    """Red, green and blue in [0, 1] as text, such as `#cc4c4c`."""
     return "#" + "".join(f"{round(255 * float(np.clip(x, 0, 1))):02x}" for x in rgba[:3])
 
 
+def find_camera(model: Any) -> int | None:
+    """The first camera that stands in the world or follows a body, not one that a moving body carries."""
+    stands = (model.cam_bodyid == 0) | (model.cam_mode != mujoco.mjtCamLight.mjCAMLIGHT_FIXED)
+    return next(iter(np.flatnonzero(stands).tolist()), None)
+
+
 def camera_axes(model: Any) -> np.ndarray:
-    """Right, up and towards the viewer, `[3, 3]`: axes of the model's first camera, or a view from the side."""
-    if model.ncam == 0:
+    """Right, up and towards the viewer, `[3, 3]`: axes of the camera of `find_camera`, or a view from the side."""
+    camera = find_camera(model)
+    if camera is None:
         return SIDE
     data = mujoco.MjData(model)
     mujoco.mj_kinematics(model, data)
     mujoco.mj_comPos(model, data)  # a camera may look at a centre of mass
     mujoco.mj_camlight(model, data)
-    return data.cam_xmat[0].reshape(3, 3).T
+    return data.cam_xmat[camera].reshape(3, 3).T
 
 
-def _find_rgba(model: Any, geom: int) -> np.ndarray:
+def is_planar(model: Any) -> bool:
+    """Whether the robot moves in the picture's plane only: no joint turns or shifts it out of that plane.
+
+    Joints are looked at where the model's own pose has them, so a robot counts as planar if all hinges are parallel to
+    the line of sight there, and all slides perpendicular to it.
+    """
+    data = mujoco.MjData(model)
+    mujoco.mj_kinematics(model, data)
+    towards = np.abs(data.xaxis @ camera_axes(model)[2])
+    hinges, slides = (model.jnt_type == kind for kind in (mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE))
+    return bool(np.all(np.where(hinges, towards > PARALLEL, slides & (towards < 1 - PARALLEL))))
+
+
+def find_rgba(model: Any, geom: int) -> np.ndarray:
+    """The geom's own colour or that of its material, `[4]`."""
     material = model.geom_matid[geom]
     return model.geom_rgba[geom] if material < 0 else model.mat_rgba[material]
 
@@ -194,7 +215,7 @@ def _find_motors(model: Any, axes: np.ndarray) -> list[Motor]:
         if model.actuator_trntype[command] != mujoco.mjtTrn.mjTRN_JOINT:
             continue
         towards = float(data.xaxis[joint] @ axes[2])
-        if model.jnt_type[joint] == mujoco.mjtJoint.mjJNT_HINGE and abs(towards) > 0.9:
+        if model.jnt_type[joint] == mujoco.mjtJoint.mjJNT_HINGE and abs(towards) > PARALLEL:
             motors.append(Motor(command, int(joint), 1 if towards > 0 else -1))
     return motors
 
@@ -222,7 +243,7 @@ def draw(picture: Picture, qpos: np.ndarray, goal: np.ndarray | None = None) -> 
     joints, numbers = [motor.joint for motor in picture.motors], [part.number for part in picture.parts]
     place, turn = np.zeros((len(qpos), len(numbers), 3)), np.zeros((len(qpos), len(numbers), 3, 3))
     anchors = np.zeros((len(qpos), len(joints), 3))
-    for i, q in enumerate(_fill_gaps(qpos, model.qpos0)):
+    for i, q in enumerate(fill_gaps(qpos, model.qpos0)):
         data.qpos = q
         mujoco.mj_kinematics(model, data)
         mujoco.mj_comPos(model, data)  # for the centres of the bodies
@@ -236,7 +257,7 @@ def draw(picture: Picture, qpos: np.ndarray, goal: np.ndarray | None = None) -> 
     return _center(picture, frames)
 
 
-def _fill_gaps(qpos: np.ndarray, first: np.ndarray) -> Iterator[np.ndarray]:
+def fill_gaps(qpos: np.ndarray, first: np.ndarray) -> Iterator[np.ndarray]:
     """Each position, or the last finite one before it."""
     for q in qpos:
         first = q if np.isfinite(q).all() else first

@@ -23,7 +23,9 @@ TIMEOUT = 120  # seconds
 ATTEMPT = "import mujoco; mujoco.Renderer(mujoco.MjModel.from_xml_string('<mujoco/>'), 8, 8).render()"
 
 
-def find_backend(environment: Mapping[str, str], works: Callable[[str], bool], system: str = sys.platform) -> str:
+def find_backend(
+    environment: Mapping[str, str], works: Callable[[str], bool], system: str = sys.platform
+) -> str | None:
     """The backend to draw with: the one that MUJOCO_GL names, else the first of EGL and OSMesa that works.
 
     Args:
@@ -32,10 +34,10 @@ def find_backend(environment: Mapping[str, str], works: Callable[[str], bool], s
       system: as `sys.platform`.
 
     Returns:
-      "egl", "osmesa", or "" for another backend, chosen by MuJoCo.
+      "egl", "osmesa", or "" for another backend, chosen by MuJoCo; None if none works.
 
     Raises:
-      UserError: the backend that the user has chosen does not work, or none does.
+      UserError: the backend that the user has chosen does not work.
     """
     name = environment.get("MUJOCO_GL", "").strip().lower()
     if name:
@@ -45,7 +47,7 @@ def find_backend(environment: Mapping[str, str], works: Callable[[str], bool], s
     for name in HEADLESS if system == "linux" else (MUJOCO_DEFAULT,):
         if works(name):
             return name
-    raise UserError(f"there is no OpenGL to draw with, neither EGL nor OSMesa: {' or '.join(INSTALL.values())}")
+    return None
 
 
 def _remedy(name: str) -> str:

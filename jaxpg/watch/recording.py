@@ -25,12 +25,14 @@ class Look(NamedTuple):
     Attributes:
       qpos: joint positions, `[..., nq]`.
       goal: position of the goal, `[..., 3]` [m].
+      rotation: orientation of the goal, `[..., 3, 3]`.
       plane: coordinates in the phase plane, `[..., 2]`.
     """
 
     qpos: Any
     goal: Any
     plane: Any
+    rotation: Any = None
 
 
 class Recording(NamedTuple):
@@ -103,6 +105,7 @@ def make_look(view: View) -> Callable[[Any], Look]:
             qpos=scene.qpos(state) if scene else None,
             goal=scene.goal(state) if scene and scene.goal else None,
             plane=plane.coordinates(state) if plane else None,
+            rotation=scene.goal_rotation(state) if scene and scene.goal_rotation else None,
         )
 
     return look

@@ -48,8 +48,11 @@ def render(options: RenderOptions, changes: Mapping[str, Any], say: Callable[[st
     folder.find(options.run)
     _check_size(options)
     backend = gl.find_backend(os.environ, gl.is_working)
+    if backend is None:
+        remedy = " or ".join(gl.INSTALL.values())
+        say(f"note: there is no OpenGL, so the video is drawn in a simpler way; for MuJoCo's renderer: {remedy}")
     with physics_cache(options.cache):
-        stored = _load_policy(options.run, options, changes)
+        stored = load_drawable(options.run, options.checkpoint, options.agent, changes)
     with compilation_cache(options.cache, say):
         clips = play_clips(stored, options.episodes, options.seed)
     interval, seconds = choose_pace(clips[0].dt, options.speed, min(options.fps, format_.fastest))
@@ -84,14 +87,24 @@ def choose_grid(number: int) -> tuple[int, int]:
     return math.ceil(number / columns), columns
 
 
-def _load_policy(run: str, options: RenderOptions, changes: Mapping[str, Any]) -> StoredPolicy:
-    checkpoint = "best" if options.checkpoint == "untrained" else options.checkpoint
-    stored = policies.load(run, checkpoint, options.agent, changes)
+def load_drawable(run: str, checkpoint: str, agent: int | None, changes: Mapping[str, Any]) -> StoredPolicy:
+    """A policy of a run whose environment can be drawn.
+
+    Args:
+      run: the run folder.
+      checkpoint: "best", "last" or "untrained".
+      agent: index of the agent, from 0; None takes the best.
+      changes: changed options of the environment.
+
+    Raises:
+      UserError: there is no such run or policy, or its environment cannot be drawn.
+    """
+    stored = policies.load(run, "best" if checkpoint == "untrained" else checkpoint, agent, changes)
     notes: list[str] = []
     if find_view(stored.env, notes.append).scene is None:
         reason = f": {'; '.join(notes)}" if notes else " has no robot that could be drawn"
         raise UserError(f"env={stored.config.choices['env']}{reason}")
-    return make_untrained(stored) if options.checkpoint == "untrained" else stored
+    return make_untrained(stored) if checkpoint == "untrained" else stored
 
 
 def play_clips(stored: StoredPolicy, number: int, seed: int) -> list[Clip]:
@@ -121,7 +134,7 @@ def shown_steps(clips: Sequence[Clip], interval: int) -> list[int]:
 
 
 def draw_images(
-    stored: StoredPolicy, clips: Sequence[Clip], interval: int, size: tuple[int, int], backend: str
+    stored: StoredPolicy, clips: Sequence[Clip], interval: int, size: tuple[int, int], backend: str | None
 ) -> Iterator[np.ndarray]:
     """The images of the video, `[H, W, 3]`.
 
@@ -130,27 +143,44 @@ def draw_images(
       clips: episodes with every step.
       interval: number of steps from one picture to the next.
       size: width and height of one episode's picture.
-      backend: from `gl.find_backend`.
+      backend: from `gl.find_backend`; None draws without OpenGL.
     """
+    from jaxpg.watch import solids, space
     from jaxpg.watch.canvas import Canvas
+    from jaxpg.watch.sketch import Sketch
 
     scene = find_view(stored.env).scene
     assert scene is not None  # or its policy would not have been loaded
-    with Canvas(scene.model, backend, choose_grid(len(clips)), size, scene.goal_radius) as canvas:
+    parts = solids.make_parts(scene.model)
+    framing = space.make_framing(scene.model, parts, [one.look for one in clips])
+    shifts = [space.find_shifts(scene.model, parts, one.look.qpos, framing) for one in clips]
+    grid, marks = choose_grid(len(clips)), (scene.goal_radius, scene.site, framing)
+    tool = (
+        Sketch(scene.model, grid, size, *marks) if backend is None else Canvas(scene.model, backend, grid, size, *marks)
+    )
+    with tool as canvas:
         for step in shown_steps(clips, interval):
-            yield canvas.draw([make_cell(stored, scene, one, step) for one in clips])
+            cells = zip(clips, shifts, strict=True)
+            yield canvas.draw([make_cell(stored, scene, one, step, shift) for one, shift in cells])
 
 
-def make_cell(stored: StoredPolicy, scene: Scene, one: Clip, step: int) -> Any:
-    """The picture of an episode at a step; after its end, the last one."""
+def make_cell(stored: StoredPolicy, scene: Scene, one: Clip, step: int, shifts: np.ndarray | None = None) -> Any:
+    """The picture of an episode at a step; after its end, the last one.
+
+    Args:
+      stored, scene: the policy that plays and its robot.
+      one: the episode.
+      step: number of the step, from 0.
+      shifts: what is added to the centre of the picture at each step, `[F, 3]` [m], or None.
+    """
     from jaxpg.watch.canvas import Cell
 
     last, names = len(one.look.qpos) - 1, find_command_names(stored)
     current = min(step, last)
     commands = np.array([one.series[name][current] if current < last else 0.0 for name in names])
     efforts = commands / find_limits(stored) if len(names) == scene.model.nu else np.zeros(scene.model.nu)
-    goal = None if one.look.goal is None else one.look.goal[current]
-    return Cell(one.look.qpos[current], goal, efforts, _make_caption(one, current, last))
+    goal, rotation, shift = (None if x is None else x[current] for x in (one.look.goal, one.look.rotation, shifts))
+    return Cell(one.look.qpos[current], goal, efforts, _make_caption(one, current, last), rotation, shift)
 
 
 def _make_caption(one: Clip, current: int, last: int) -> str:

@@ -30,10 +30,8 @@ def find_view(env: Env, say: Callable[[str], None] = lambda line: None) -> View:
     """What can be drawn of `env`; `say` takes a line for each thing that it has but that cannot be drawn."""
     state = jax.eval_shape(env.reset, jax.random.key(0))
     scene = attempt("picture of the robot", lambda: _find_scene(env, state), say)
-    if scene and scene.goal:
-        has_goal = functools.partial(_has_goal, scene.goal, scene.goal_radius, state)
-        if not attempt("goal", has_goal, say):
-            scene = scene._replace(goal=None, goal_radius=None)
+    if scene and scene.goal and not attempt("goal", functools.partial(_has_goal, scene, state), say):
+        scene = scene._replace(goal=None, goal_radius=None, goal_rotation=None)
     return View(scene, attempt("phase portrait", lambda: _find_plane(env, state), say))
 
 
@@ -46,16 +44,21 @@ def _find_scene(env: Env, state: Any) -> Scene | None:
     if not isinstance(scene.model, mujoco.MjModel):
         raise DrawingError(f"scene.model is a {type(scene.model).__name__}, expected a mujoco.MjModel")
     _check_shape("scene.qpos(state)", scene.qpos, (state,), (scene.model.nq,))
+    if scene.site is not None and not 0 <= scene.site < scene.model.nsite:
+        raise DrawingError(f"scene.site is {scene.site}, the model has {scene.model.nsite} sites")
     dt = _ask("dt", find_time_step, env)
     if not 0 < dt < math.inf:
         raise DrawingError(f"dt is {dt}, expected seconds between two actions")
     return scene
 
 
-def _has_goal(goal: Callable, radius: float | None, state: Any) -> bool:
-    _check_shape("scene.goal(state)", goal, (state,), (3,))
-    if radius is not None and not 0 < float(radius) < math.inf:
-        raise DrawingError(f"scene.goal_radius is {radius}, expected metres or None")
+def _has_goal(scene: Scene, state: Any) -> bool:
+    assert scene.goal is not None  # whoever asks has looked
+    _check_shape("scene.goal(state)", scene.goal, (state,), (3,))
+    if scene.goal_radius is not None and not 0 < float(scene.goal_radius) < math.inf:
+        raise DrawingError(f"scene.goal_radius is {scene.goal_radius}, expected metres or None")
+    if scene.goal_rotation:
+        _check_shape("scene.goal_rotation(state)", scene.goal_rotation, (state,), (3, 3))
     return True
 
 

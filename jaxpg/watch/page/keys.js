@@ -14,9 +14,10 @@ const KEYS_IN_WORDS = [
 ];
 
 /** The short line that says them. */
-export function keysLine() {
-  const parts = KEYS_IN_WORDS.map(([keys, words]) =>
-    element("span", {}, ...keys.map((key) => element("kbd", {}, key)), ` ${words}`),
+export function keysLine(player) {
+  const words = [...KEYS_IN_WORDS, ...(player.space ? [[["V"], "view"], [["drag"], "turn"]] : [])];
+  const parts = words.map(([keys, meaning]) =>
+    element("span", {}, ...keys.map((key) => element("kbd", {}, key)), ` ${meaning}`),
   );
   return element("p", { class: "keys" }, ...parts);
 }
@@ -46,6 +47,7 @@ function keyActions(player, view) {
     "[": () => turn("episode", -1, episodes),
     "]": () => turn("episode", 1, episodes),
     p: () => turn("policy", 1, player.policies.length),
+    v: () => document.getElementById("stage").dispatchEvent(new Event("turn")),
   };
 }
 

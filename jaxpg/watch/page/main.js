@@ -21,7 +21,7 @@ function section(title, ...children) {
 function linkedViews() {
   const view = shared(startOf(data));
   const { player } = data;
-  const views = element("div", { class: "views" });
+  const views = element("div", { class: player?.space ? "views in-space" : "views" });
   if (player) views.append(stage(player, view));
   if (data.portrait) views.append(portrait(data.portrait, player, view));
   if (data.workspace) views.append(workspace(data.workspace, player, view));
@@ -29,7 +29,7 @@ function linkedViews() {
   if (!views.children.length) return [];
   if (!player) return [section("Policy", views)];
   startKeys(player, view);
-  return [section("Rollout", choices(player, view), views, keysLine())];
+  return [section("Rollout", choices(player, view), views, keysLine(player))];
 }
 
 /** Panels of curves; a series has the same colour in all panels of the page. */

@@ -3,8 +3,10 @@
 import { element, inlineMark, onWidth, shape } from "./dom.js";
 import { clamp, fixed, text } from "./numbers.js";
 import { chosen, decimals, frameOf } from "./rollout.js";
+import { paintSpace } from "./space.js";
 import { paintStage } from "./stage.js";
 import { onTheme } from "./theme.js";
+import { startTurning } from "./turning.js";
 
 const SPEEDS = [0.25, 0.5, 1, 2, 4];
 
@@ -61,17 +63,20 @@ export function ending(episode) {
 
 /** The stage with its bar; starts the clock. */
 export function stage(player, view) {
-  const canvas = element("canvas", { id: "stage", tabindex: 0, role: "img", "aria-label": "drawing of the rollout" });
+  const label = { role: "img", "aria-label": "drawing of the rollout" };
+  const canvas = element("canvas", { id: "stage", class: player.space ? "turned" : null, tabindex: 0, ...label });
   const reading = element("p", { class: "reading", id: "so-far" });
+  const turning = player.space && startTurning(canvas, player.space, () => paint());
   const paint = () => {
-    paintStage(canvas, player, view.state);
+    if (turning) paintSpace(canvas, player, view.state, turning.view);
+    else paintStage(canvas, player, view.state);
     reading.replaceChildren(...returnReading(chosen(player, view.state), view.state));
   };
   const figure = element("figure", { class: "stage" }, canvas, bar(player, view), reading);
-  canvas.addEventListener("click", () => toggle(player, view));
+  canvas.addEventListener("click", () => turning?.wasDragged() || toggle(player, view));
+  canvas.addEventListener("turn", () => turning?.next());
   onWidth(figure, (width) => {
-    const [left, low, right, high] = player.view;
-    canvas.style.height = `${Math.round(clamp((width * (high - low)) / (right - left), 160, 460))}px`;
+    canvas.style.height = `${Math.round(clamp(width * shapeOf(player), 160, player.space ? 540 : 460))}px`;
     paint();
   });
   addEventListener("resize", paint); // also when the page is zoomed, or taken to a finer screen
@@ -79,6 +84,13 @@ export function stage(player, view) {
   view.listen(paint);
   startClock(player, view);
   return figure;
+}
+
+/** Height of the stage for a width of 1. */
+function shapeOf({ space, view }) {
+  if (space) return 0.8;
+  const [left, low, right, high] = view;
+  return (high - low) / (right - left);
 }
 
 function returnReading(episode, state) {

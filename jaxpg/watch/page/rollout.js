@@ -18,7 +18,7 @@ export function shared(state) {
 
 /** The state at the start: the last but one policy is the best where there are three, so the second is shown. */
 export function startOf(data) {
-  const policies = data.player?.policies ?? data.workspace?.points ?? data.portrait?.values ?? [];
+  const policies = data.player?.policies ?? data.workspace?.pictures[0].points ?? data.portrait?.values ?? [];
   return { policy: Math.min(1, policies.length - 1), episode: 0, position: 0, speed: 1, playing: false, ghost: false };
 }
 
@@ -27,9 +27,9 @@ const recordings = new WeakMap();
 /** An episode with its numbers unpacked, and its return up to each frame. */
 function recorded(episode) {
   if (!recordings.has(episode)) {
-    const parts = unpack(episode.parts);
-    const motors = unpack(episode.motors);
-    recordings.set(episode, { ...episode, parts, motors, soFar: episode.so_far ?? returnsSoFar(episode) });
+    const packed = ["parts", "motors", "qpos", "shifts"].filter((name) => episode[name]);
+    const unpacked = Object.fromEntries(packed.map((name) => [name, unpack(episode[name])]));
+    recordings.set(episode, { ...episode, ...unpacked, soFar: episode.so_far ?? returnsSoFar(episode) });
   }
   return recordings.get(episode);
 }

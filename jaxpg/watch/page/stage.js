@@ -12,7 +12,7 @@ export function paintStage(canvas, player, state) {
   const place = placing(canvas, player.view);
   const episode = chosen(player, state);
   const ghost = ghostOf(player, state);
-  paintGround(context, canvas, place, player.view);
+  paintSquares(context, canvas, place, player.view);
   if (episode.goal) paintGoal(context, place, player, episode);
   const dials = dialsOf(context, place, player, episode, state.position);
   paintDials(context, dials);
@@ -22,7 +22,7 @@ export function paintStage(canvas, player, state) {
 }
 
 /** A cleared canvas in units of CSS pixels, as fine as the screen. */
-function sharp(canvas) {
+export function sharp(canvas) {
   const ratio = devicePixelRatio || 1;
   const [width, height] = [Math.round(canvas.clientWidth * ratio), Math.round(canvas.clientHeight * ratio)];
   if (canvas.width !== width || canvas.height !== height) Object.assign(canvas, { width, height });
@@ -42,7 +42,7 @@ function placing(canvas, [left, low, right, high]) {
 }
 
 /** A faint grid, and a bar that says how long its meshes are. */
-function paintGround(context, canvas, place, [left, low, right, high]) {
+function paintSquares(context, canvas, place, [left, low, right, high]) {
   const mesh = niceStep(Math.max(right - left, high - low), 8);
   const [width, height] = [canvas.clientWidth, canvas.clientHeight];
   context.strokeStyle = colour("grid");
