@@ -6,15 +6,20 @@ import json
 import runpy
 import subprocess
 import sys
+import types
 from pathlib import Path
 
 import gymnasium
 import jax
 import mujoco
 import numpy as np
+import onnx
 import pytest
+from onnx.reference import ReferenceEvaluator
 
+from envs.base import State
 from jaxpg.config.parsing import compose
+from jaxpg.errors import UserError
 
 EXPERIMENTS = Path(__file__).parent.parent / "experiments"
 PEERS = EXPERIMENTS / "peers"
@@ -199,6 +204,17 @@ def test_long_run(experiments, monkeypatch):
     long_run.main([str(experiments / "claw.xml"), "--envs", "3", "--steps", "20", "--long_steps", "100"])
     found = json.loads((experiments / "long_run.json").read_text())
     assert found["models"][0]["ours"]["velocity"][1] > 1e-6
+
+
+def test_systems_of_long_runs_are_names_or_model_files(experiments):
+    import long_run
+
+    path = experiments / "claw.xml"
+    path.write_text(CLAW.format(1))
+    name = f"{experiments.name}/claw"
+    assert long_run.find_systems(["ant", str(path)]) == {"ant": long_run.SYSTEMS["ant"], name: path}
+    with pytest.raises(UserError, match=r"atn: expected a model file or one of .*; ant$"):
+        long_run.find_systems(["atn"])
 
 
 @pytest.mark.study
@@ -423,33 +439,48 @@ def test_the_evaluation_is_gymnasiums(monkeypatch):
     assert returns.mean() > -400
 
 
+SMALL = ("num_envs=4", "num_steps=4", "total_steps=32", "algo.num_shards=1", "algo.minibatches=1", "eval_episodes=2")
+
+
+@pytest.fixture
+def reach(monkeypatch):
+    import reach
+
+    monkeypatch.setattr(reach, "prepare", lambda config: None)  # it is too late in this process
+    monkeypatch.setattr(reach, "divide_cpu", lambda: None)
+    monkeypatch.setattr(reach, "GOALS", 4)
+    return reach
+
+
+def test_reached_is_what_was_held_to_the_end(reach, monkeypatch):
+    """Of four goals one is left again, and one is held within 2 cm but not within 1 cm; angles count with pose only."""
+
+    class Training(reach.Training):
+        def __init__(self):
+            env = types.SimpleNamespace(hold_time=0.04, dt=0.02, success_angle=0.1)
+            self.config = types.SimpleNamespace(env=env)
+            self.state = types.SimpleNamespace()
+
+    distance = np.array(
+        [[0.5, 0.3, 0.004, 0.003], [0.5, 0.3, 0.019, 0.004], [0.5, 0.004, 0.2, 0.004], [0.1, 0.1, 0.1, 0.1]]
+    )
+    angle = np.array([[0.0] * 4, [0.0] * 4, [0.0] * 4, [0.0] * 4])
+    metrics = {"distance": distance[:, -1], "jerk": np.ones(4), "limit_violation": np.zeros(4)}
+    monkeypatch.setattr(reach, "get_policy", lambda state: ())
+    found = Training().try_policy(lambda policy: (metrics, (distance, angle)))
+    assert found["shares"] == [0.5, 0.5, 0.25]
+    angle[0, -1] = 0.2
+    assert Training().try_policy(lambda policy: (metrics, (distance, angle)))["shares"] == [0.25, 0.25, 0.0]
+
+
 @pytest.mark.study
-def test_panda_reach(experiments, monkeypatch):
-    import panda_reach
-
-    sizes = ("num_envs=4", "num_steps=2", "algo.num_shards=1", "algo.minibatches=1", "eval_episodes=2")
-    training = panda_reach.Training
-    monkeypatch.setattr(panda_reach, "prepare", lambda config: None)  # it is too late in this process
-    monkeypatch.setattr(panda_reach, "Training", lambda physics: training(physics, sizes))
-    panda_reach.main(["--physics", "mujoco", "--rounds", "2"])
-    (row,) = json.loads((experiments / "panda_reach.json").read_text())
-    assert row["physics"] == "mujoco"
-    assert 0 < row["rate"][0] <= row["rate"][1] <= row["rate"][2]
-
-
-def test_the_pandas_flange_is_observed_where_c_mujoco_has_it(experiments):
-    import panda_reach
-
-    env = panda_reach.Reach(panda_reach.ReachConfig(physics="mujoco"))
-    state = jax.jit(env.reset)(jax.random.key(0))
-    data = mujoco.MjData(env.model)
-    data.qpos = state.pipeline_state.qpos
-    mujoco.mj_kinematics(env.model, data)
-    error = np.asarray(state.pipeline_state.goal) - data.site("flange").xpos
-    np.testing.assert_allclose(state.obs[-3:], error, atol=1e-6)
-    after = jax.jit(env.step)(state, np.zeros(7, np.float32))
-    squared = np.sum(error**2)
-    np.testing.assert_allclose(after.reward, -squared - squared**0.5, rtol=1e-5)
+def test_reach(reach, experiments):
+    options = [argument for option in SMALL for argument in ("--option", option)]
+    reach.main(["so100", "--seeds", "1", *options])
+    (found,) = json.loads((experiments / "reach.json").read_text())
+    (row,) = found["seeds"]
+    assert row["steps"] >= 32
+    assert all(0 <= share <= 1 for who in ("end", "mujoco") for share in row[who]["shares"])
 
 
 @pytest.mark.study
@@ -460,6 +491,87 @@ def test_mujoco_environments(experiments, capsys):
     mujoco_environments.main(["brax:inverted_pendulum", "brax:swimmer", *sizes])
     found, refused = json.loads((experiments / "mujoco_environments.json").read_text())
     assert found["scalar"]["reward"] == found["mujoco"]["reward"] == found["mjx"]["reward"] == 1
-    assert found["ratio"][1] == pytest.approx(found["scalar"]["rate"][1] / found["mjx"]["rate"][1])
+    assert found["mjx"]["ratio"][1] == pytest.approx(found["scalar"]["rate"][1] / found["mjx"]["rate"][1])
     assert "swimmer" in refused["error"]
     assert len(capsys.readouterr().out.splitlines()) == 3
+
+
+@pytest.mark.study
+def test_rewards_of_mujoco_environments_are_those_of_the_same_states_and_actions(experiments):
+    import mujoco_environments
+
+    # enough environments that only the equations are divided over devices, where there are several
+    sizes = ("--envs", str(16 * mujoco_environments.count_parts(2**20)), "--steps", "5", "--rounds", "1")
+    mujoco_environments.main(["brax:inverted_double_pendulum", *sizes, "--without", "mjx"])
+    (found,) = json.loads((experiments / "mujoco_environments.json").read_text())
+    assert found["scalar"]["difference"][1] < 1e-4
+    assert found["scalar"]["reward"] == pytest.approx(found["mujoco"]["reward"], abs=1e-5)
+
+
+def test_a_mean_reward_ends_with_the_first_episode():
+    import mujoco_environments
+
+    rewards = np.array([[1.0, 2.0, 9.0], [1.0, 2.0, 3.0]])
+    parts = [(rewards[:, :1], np.zeros((2, 1))), (rewards[:, 1:], np.array([[1, 0], [0, 0]]))]
+    np.testing.assert_array_equal(mujoco_environments.average_rewards(parts), [1.5, 2.0])
+
+
+def save_network(path, *nodes, axis=-1):
+    """An ONNX file of a network from three observations to two commands, by the given operators after a layer."""
+    helper, kind = onnx.helper, onnx.TensorProto.FLOAT
+    random = np.random.default_rng(0)
+    constants = {"mean": random.normal(size=3), "weight": random.normal(size=(3, 4)), "bias": random.normal(size=4)}
+    layer = ("Sub", ["obs", "mean"], ["centred"]), ("Gemm", ["centred", "weight", "bias"], ["x"])
+    graph = helper.make_graph(
+        [helper.make_node(*node, **{"axis": axis} if node[0] == "Split" else {}) for node in (*layer, *nodes)],
+        "policy",
+        [helper.make_tensor_value_info("obs", kind, [None, 3])],
+        [helper.make_tensor_value_info("action", kind, [None, 2])],
+        [onnx.numpy_helper.from_array(x.astype(np.float32), name) for name, x in constants.items()],
+    )
+    onnx.save(helper.make_model(graph, opset_imports=[helper.make_opsetid("", 11)]), path)
+    return path
+
+
+def test_a_published_policy_acts_as_its_file_says(experiments):
+    import published_policies
+
+    tail = (
+        ("Sigmoid", ["x"], ["s"]),
+        ("Mul", ["x", "s"], ["y"]),
+        ("Split", ["y"], ["z", "w"]),
+        ("Tanh", ["z"], ["action"]),
+    )
+    path = save_network(experiments / "policy.onnx", *tail)
+    obs = np.random.default_rng(1).normal(size=(5, 3)).astype(np.float32)
+    (expected,) = ReferenceEvaluator(str(path)).run(None, {"obs": obs})
+    np.testing.assert_allclose(published_policies.read_policy(path)(obs), expected, atol=1e-6)
+    other = save_network(experiments / "other.onnx", ("Relu", ["x"], ["y"]), ("Split", ["y"], ["action", "w"]))
+    with pytest.raises(UserError, match="its operators Relu are not among Sub, Mul"):
+        published_policies.read_policy(other)
+    rows = save_network(experiments / "rows.onnx", ("Split", ["x"], ["action", "w"]), axis=0)
+    with pytest.raises(UserError, match="its operators Split are not among"):
+        published_policies.read_policy(rows)
+    (experiments / "text.onnx").write_text("weights")
+    with pytest.raises(UserError, match="cannot be read as an ONNX model"):
+        published_policies.read_policy(experiments / "text.onnx")
+
+
+def test_a_return_ends_with_the_first_episode(experiments):
+    import published_policies
+
+    class Counting:
+        """Earns the action, and ends after two steps where the key says so."""
+
+        def reset(self, key):
+            flag = jax.random.bernoulli(key).astype(float)
+            return State(None, np.zeros(1), flag * 0, flag * 0, {"flag": flag, "time": flag * 0})
+
+        def step(self, state, action):
+            now = state.metrics["time"] + 1
+            done = state.metrics["flag"] * (now == 2)
+            return state.replace(reward=action, done=done, metrics={**state.metrics, "time": now})
+
+    returns, ended = published_policies.play(Counting(), lambda obs: obs[:, 0] + 1.5, 8, 5)
+    assert 0 < ended.sum() < 8
+    np.testing.assert_array_equal(returns, np.where(ended, 3.0, 7.5))
