@@ -23,7 +23,6 @@ episode and costs `lambda_fall`; the time limit is a truncation. `success` is 1 
 from __future__ import annotations
 
 import dataclasses
-import logging
 import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, NamedTuple
@@ -34,10 +33,12 @@ import numpy as np
 from flax import struct
 
 from envs.arm import sample_ring
-from envs.base import Interface, MjxEnv, State, initial_state
+from envs.base import Interface, State, initial_state
 from envs.options import OptionError, option
 from envs.physics import COLLISION, PHYSICS
 from envs.robots import WHEEL_CONTROLS, load_robot, make_wheel_control
+from envs.robots.quaternions import to_matrix, turn_about_z
+from envs.robots.tasks import RobotEnv, count_hold_steps, divide_step, find_length, log_guesses
 from envs.robots.wheels import (
     SPEED,
     TIME_CONSTANT,
@@ -52,9 +53,6 @@ from envs.scenes import Scene
 if TYPE_CHECKING:
     import mujoco
 
-logger = logging.getLogger(__name__)
-
-TINY = 1e-12  # under a square root, whose gradient at 0 then is 0
 NEAR, FAR = 0.02, 0.2  # distances below which the heading counts, precise and lesson [m]
 PRECISION, PULL = 0.05, 0.1  # of the logarithm in the precise reward [m]
 SCALES = (0.2, 0.05, 0.01)  # at which the error is observed besides [m]
@@ -173,29 +171,23 @@ class Errors(NamedTuple):
     @property
     def distance(self) -> jax.Array:
         """D = |(x_g, y_g) - (x, y)| [m]; its gradient is 0 at the goal itself."""
-        return jnp.sqrt(jnp.sum(self.position**2) + TINY)
+        return find_length(self.position)
 
 
-class Drive(MjxEnv):
+class Drive(RobotEnv):
     """A robot that drives to a pose; see the module's docstring for its equations."""
 
     def __init__(self, config: DriveConfig = DriveConfig()):
         self.config = config
         spec = load_robot(config.robot, SHIPPED)
-        num_substeps = max(1, round(config.dt / spec.option.timestep))
-        spec.option.timestep = config.dt / num_substeps
+        num_substeps = divide_step(spec, config.dt)
         self.control = make_wheel_control(spec, config.control, config.torque, config.speed, config.collision)
         self.robot = robot = self.control.robot
-        for guess in robot.guesses:
-            logger.warning("%s: %s", robot.name, guess)
+        log_guesses(robot.name, robot.guesses)
         add_camera(spec, config.goal_max)
-        self.fields = ("qpos", "qvel", "qacc_warmstart", *(("act",) if robot.model.na else ()))
-        inputs, outputs = (*self.fields, "ctrl"), (*self.fields, "qfrc_actuator")
-        super().__init__(
-            spec, num_substeps, config.physics, False, inputs=inputs, outputs=outputs, collision=config.collision
-        )
+        super().__init__(spec, robot.model, num_substeps, config.physics, config.collision)
         self.wheel_dofs = np.array([wheel.dof for wheel in robot.wheels])
-        self.hold_steps = max(1, math.ceil(config.hold_time / config.dt - 1e-6))
+        self.hold_steps = count_hold_steps(config.hold_time, config.dt)
 
     @property
     def action_size(self) -> int:
@@ -238,9 +230,7 @@ class Drive(MjxEnv):
     def step(self, state: State, action: jax.Array) -> State:
         """One step of `dt` under the command of the action, clipped to [-1, 1]."""
         before, action = state.pipeline_state, jnp.clip(action, -1.0, 1.0)
-        ctrl = self.control.command(action)
-        *moved, force = self.physics_step(*(getattr(before, name) for name in self.fields), ctrl)
-        after = before.replace(action=action, **dict(zip(self.fields, moved, strict=True)))
+        after, force = self.advance(before.replace(action=action), self.control.command(action))
         motion = self.find_motion(after)
         errors = find_errors(motion, after.goal)
         after = after.replace(held=jnp.where(self._is_there(errors), before.held + 1.0, 0.0))
@@ -273,7 +263,7 @@ class Drive(MjxEnv):
         """Where the robot is and how it moves."""
         free, dof = self.robot.base
         frame, axle = jnp.asarray(self.robot.frame, float), jnp.asarray(self.robot.axle, float)
-        base = rotate(state.qpos[free + 3 : free + 7])
+        base = to_matrix(state.qpos[free + 3 : free + 7])
         axes = base @ frame.T  # the robot's, as columns
         spin = state.qvel[dof + 3 : dof + 6]  # in the base's frame
         velocity = state.qvel[dof : dof + 3] + base @ jnp.cross(spin, axle)
@@ -377,22 +367,9 @@ def add_camera(spec: mujoco.MjSpec, reach: float) -> None:
         spec.worldbody.add_camera(name="from above", pos=[0, 0, height], fovy=FIELD)
 
 
-def rotate(quaternion: jax.Array) -> jax.Array:
-    """The rotation matrix `[3, 3]` of a unit quaternion (w, x, y, z)."""
-    w, x, y, z = quaternion
-    return jnp.stack(
-        [
-            jnp.stack([1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)]),
-            jnp.stack([2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)]),
-            jnp.stack([2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)]),
-        ]
-    )
-
-
 def turn_base(qpos: jax.Array, free: int, heading: jax.Array) -> jax.Array:
     """The positions after the base, whose free joint begins at `free`, has turned about the vertical at the origin."""
-    cosine, sine = jnp.cos(heading / 2), jnp.sin(heading / 2)
-    place = rotate(jnp.stack([cosine, 0.0 * sine, 0.0 * sine, sine])) @ qpos[free : free + 3]
-    w, x, y, z = qpos[free + 3 : free + 7]
-    turned = [cosine * w - sine * z, cosine * x - sine * y, cosine * y + sine * x, cosine * z + sine * w]
-    return qpos.at[free : free + 7].set(jnp.concatenate([place, jnp.stack(turned)]))
+    upright = jnp.array([1.0, 0.0, 0.0, 0.0], qpos.dtype)
+    place = to_matrix(turn_about_z(heading, upright)) @ qpos[free : free + 3]
+    turned = turn_about_z(heading, qpos[free + 3 : free + 7])
+    return qpos.at[free : free + 7].set(jnp.concatenate([place, turned]))

@@ -28,8 +28,6 @@ Only the object, the table and the fist collide with each other.
 
 from __future__ import annotations
 
-import dataclasses
-import logging
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -40,21 +38,35 @@ import jax.numpy as jnp
 import numpy as np
 from flax import struct
 
-from envs.base import Interface, MjxEnv, State, initial_state
+from envs.base import Interface, State, initial_state
 from envs.options import OptionError, option
 from envs.physics import PHYSICS, compile_forward, scalarize
-from envs.reach import SCALES, TINY, pull
 from envs.robots import CONTROLS, Control, load_robot, make_control, read_arm
 from envs.robots.arms import Arm
 from envs.robots.controls import Command, ControlOptions
 from envs.robots.placing import Placed, put
+from envs.robots.tasks import (
+    SCALES,
+    Record,
+    RobotEnv,
+    count_hold_steps,
+    divide_step,
+    extend_record,
+    find_length,
+    find_penalty,
+    find_record_metrics,
+    log_guesses,
+    name_actions,
+    name_joints,
+    observe_joints,
+    pull,
+    start_record,
+)
 from envs.robots.twists import damped_least_squares, limit_velocities
 from envs.scenes import Scene
 
 if TYPE_CHECKING:
     import mujoco
-
-logger = logging.getLogger(__name__)
 
 FIST, TABLE, OBJECT = "push fist", "push table", "push object"  # of what is added to the robot
 CLEARANCE = 0.01  # of the fist above the table [m]
@@ -136,25 +148,6 @@ TRAINING = {
 
 
 @struct.dataclass
-class Record:
-    """What metrics remember of an episode.
-
-    Attributes:
-      steps: since the start.
-      held: for how many steps the goal has been held.
-      actions: the last action and the one before `[2, m]`; 0 before the start.
-      jerk: sum over the steps of the mean squared second difference of the actions.
-      violation: how far a joint has been beyond its range at most [rad or m].
-    """
-
-    steps: jax.Array
-    held: jax.Array
-    actions: jax.Array
-    jerk: jax.Array
-    violation: jax.Array
-
-
-@struct.dataclass
 class PushState:
     """The motion of robot and object, the goal, and the record of the episode.
 
@@ -229,31 +222,28 @@ class Places(NamedTuple):
         return find_length(self.error)
 
 
-class Push(MjxEnv):
+class Push(RobotEnv):
     """An arm that pushes; see the module's docstring for its equations."""
 
     def __init__(self, config: PushConfig = PushConfig()):
         self.config = config
         spec = load_robot(config.robot)
-        num_substeps = max(1, round(config.dt / config.timestep))
-        set_options(spec, config.dt / num_substeps)
+        num_substeps = divide_step(spec, config.dt, config.timestep)
+        set_options(spec)
         self.frame, self.area, middle = add_fist(spec, config)
         way = "velocity" if config.control == PLANE else config.control
         told = ControlOptions(way, config.torque, None, config.step, config.dt)
         self.control = make_control(spec, FIST, told)
         self.arm = arm = self.control.arm
-        self.qpos_of, self.dof_of = (np.array([getattr(x, name) for x in arm.joints]) for name in ("qpos", "dof"))
-        self.fields = ("qpos", "qvel", "qacc_warmstart", *(("act",) if arm.model.na else ()))
         self.middle = put(arm, self._lift(np.array([self.area.middle, 0.0])), middle.angles).angles
         self.command = self.control.command
         if config.control == PLANE:
             self.command = make_command(self.control, self.frame, self.height, self.middle, config)
         self._add_object(spec)
-        inputs, outputs = (*self.fields, "ctrl"), (*self.fields, "qfrc_actuator")
-        super().__init__(spec, num_substeps, config.physics, False, inputs=inputs, outputs=outputs)
+        super().__init__(spec, arm.model, num_substeps, config.physics)
         self.find_fist = compile_forward(arm.model, outputs=(f"site_xpos[{FIST}]",))
         self.starts = jnp.asarray(self._draw_starts(), float)
-        self.hold_steps = max(1, math.ceil(config.hold_time / config.dt - 1e-6))
+        self.hold_steps = count_hold_steps(config.hold_time, config.dt)
 
     @property
     def height(self) -> float:
@@ -281,8 +271,8 @@ class Push(MjxEnv):
         place, goal = self._draw_way(key_object)
         angles = self._draw_start(key_start, place)
         turn = jax.random.uniform(key_turn, minval=-jnp.pi, maxval=jnp.pi)
-        model, zero = self.model, jnp.zeros(())
-        robot = jnp.asarray(self.arm.qpos, float).at[self.qpos_of].set(angles)
+        model = self.model
+        robot = jnp.asarray(self.arm.qpos, float).at[self.arm.qpos_of].set(angles)
         state = PushState(
             qpos=jnp.concatenate([robot, self._lay(place, turn)]),
             qvel=jnp.zeros(model.nv),
@@ -290,7 +280,7 @@ class Push(MjxEnv):
             act=self.control.start(angles) if model.na else None,
             target=angles if self.control.has_target else None,
             goal=goal,
-            record=Record(zero, zero, jnp.zeros((2, self.action_size)), zero, zero),
+            record=start_record(self.action_size),
         )
         places = self.find_places(state)
         return initial_state(state, self.observe(state, places), tuple(self._find_metrics(state.record, places)))
@@ -299,15 +289,16 @@ class Push(MjxEnv):
         """One step of `dt` under the command of the action, clipped to [-1, 1]."""
         before, action = state.pipeline_state, jnp.clip(action, -1.0, 1.0)
         ctrl, target = self.command(action, before.qpos[: self.arm.model.nq], before.target)
-        *moved, force = self.physics_step(*(getattr(before, name) for name in self.fields), ctrl)
-        record = before.record.replace(steps=before.record.steps + 1)
-        after = before.replace(target=target, record=record, **dict(zip(self.fields, moved, strict=True)))
+        after, force = self.advance(before, ctrl)
         places = self.find_places(after)
-        after = after.replace(record=self._update_record(after, places, action))
+        held = jnp.where(places.distance < self.config.success_radius, before.record.held + 1.0, 0.0)
+        record = before.record.replace(steps=before.record.steps + 1)
+        record = extend_record(record, self.arm, after.qpos[self.arm.qpos_of], held, action)
+        after = after.replace(target=target, record=record)
         return state.replace(
             pipeline_state=after,
             obs=self.observe(after, places),
-            reward=self._find_reward(before, action, force[self.dof_of]),
+            reward=self._find_reward(before, action, force[self.arm.dof_of]),
             metrics=self._find_metrics(after.record, places),
         )
 
@@ -328,10 +319,7 @@ class Push(MjxEnv):
         A vector x at three scales is x, x / (|x| + 5 cm) and x / (|x| + 1 cm). The turn, (cos, sin, rate) about the
         vertical axis, is a box's.
         """
-        angles = state.qpos[self.qpos_of]
-        turning = np.array([not joint.is_slide for joint in self.arm.joints])
-        parts = [jnp.cos(angles[turning]), jnp.sin(angles[turning]), angles[~turning], state.qvel[self.dof_of]]
-        parts += [] if state.target is None else [state.target - angles]
+        parts = observe_joints(self.arm, state)
         parts += [places.fist, places.height[None], places.object, self.frame.axes @ state.qvel[-6:-4]]
         for vector in (places.error, places.object - places.fist, places.behind - places.fist):
             parts += [vector, *(vector / (find_length(vector) + scale) for scale in SCALES)]
@@ -347,20 +335,14 @@ class Push(MjxEnv):
 
     def _name_observations(self, commands: tuple[str, ...]) -> tuple[str, ...]:
         """The names in the order of `observe`."""
-        joints = self.arm.joints
-        hinges, slides = ([joint.name for joint in joints if joint.is_slide == kind] for kind in (False, True))
-        names = [f"{function}({name})" for function in ("cos", "sin") for name in hinges]
-        names += [f"{name} [m]" for name in slides]
-        names += [f"{joint.name}' [{joint.unit}/s]" for joint in joints]
-        names += [f"{x.name} set-point - position [{x.unit}]" for x in joints] if self.control.has_target else []
+        names = name_joints(self.arm, self.control.has_target)
         names += [*(f"fist {axis} [m]" for axis in "xyz"), *(f"object {axis} [m]" for axis in "xy")]
         names += [f"object {axis}' [m/s]" for axis in "xy"]
         for what in ("goal - object", "object - fist", "place behind - fist"):
             names += [f"{what} {axis} [m]" for axis in "xy"]
             names += [f"{what} {axis} / (distance + {100 * scale:g} cm)" for scale in SCALES for axis in "xy"]
         names += ["cos(turn)", "sin(turn)", "turn' [rad/s]"] if self.config.object == "box" else []
-        if self.config.lambda_rate:
-            names += [f"last {name.partition(' [')[0]} / limit" for name in commands]
+        names += name_actions(commands) if self.config.lambda_rate else []
         return tuple(names)
 
     def _show_goal(self, state: State) -> jax.Array:
@@ -394,7 +376,7 @@ class Push(MjxEnv):
     def _add_keyframe(self, spec: mujoco.MjSpec, name: str, angles: np.ndarray, ahead: float, height: float) -> None:
         """Adds the arm at rest, with the object so far ahead of the middle and so high above the table [m]."""
         arm, control, robot = self.arm, self.control, self.arm.qpos.copy()
-        robot[self.qpos_of] = angles
+        robot[self.arm.qpos_of] = angles
         target = jnp.asarray(angles, float) if control.has_target else None
         ctrl, _ = control.command(jnp.zeros(len(control.limits)), jnp.asarray(robot, float), target)
         lying = np.array(self._lay(np.array([self.area.middle + ahead, 0.0]), jnp.zeros(())))
@@ -428,7 +410,7 @@ class Push(MjxEnv):
         """Joint positions `[n]` of a start: the first of some draws with the fist clear of the object, or the last."""
         poses = self.starts[jax.random.randint(key, (NUM_DRAWS,), 0, len(self.starts))]
         robots = jnp.broadcast_to(jnp.asarray(self.arm.qpos, float), (NUM_DRAWS, self.arm.model.nq))
-        (fists,) = jax.vmap(self.find_fist)(robots.at[:, self.qpos_of].set(poses))
+        (fists,) = jax.vmap(self.find_fist)(robots.at[:, self.arm.qpos_of].set(poses))
         width = self.config.object_radius * (math.sqrt(2.0) if self.config.object == "box" else 1.0)
         away = jnp.linalg.norm(self.frame.place(fists) - place, axis=1)
         return poses[jnp.argmax((away > width + self.config.fist_radius + GAP).at[-1].set(True))]
@@ -440,54 +422,22 @@ class Push(MjxEnv):
         cost = config.lambda_pos * (distance**2 + pull(distance))
         cost += config.lambda_fist * find_length(places.behind - places.fist) * distance / (distance + SCALES[0])
         cost += config.lambda_height * jnp.abs(places.height - self.height)
-        low, high = self.arm.ranges
-        angles, margin = state.qpos[self.qpos_of], config.limit_margin
-        near = jnp.maximum(0.0, jnp.maximum(low + margin - angles, angles - high + margin))
-        penalty = config.lambda_torque * jnp.sum(torque**2)
-        penalty += config.lambda_velocity * jnp.sum(state.qvel[self.dof_of] ** 2)
-        penalty += config.lambda_rate * jnp.sum((action - state.record.actions[0]) ** 2)
-        penalty += config.lambda_limit * jnp.sum(near**2)
-        return -cost - penalty
-
-    def _update_record(self, state: PushState, places: Places, action: jax.Array) -> Record:
-        """The record after a step, whose number of steps is that of `state` already, under an action."""
-        (low, high), record = self.arm.ranges, state.record
-        angles = state.qpos[self.qpos_of]
-        excess = jnp.max(jnp.maximum(low - angles, angles - high), initial=0.0)
-        last, before = record.actions
-        return dataclasses.replace(
-            record,
-            held=jnp.where(places.distance < self.config.success_radius, record.held + 1.0, 0.0),
-            actions=jnp.stack([action, last]),
-            jerk=record.jerk + jnp.mean((action - 2 * last + before) ** 2),
-            violation=jnp.maximum(record.violation, excess),
-        )
+        return -cost - find_penalty(config, self.arm, state, torque, action, state.record.actions[0])
 
     def _find_metrics(self, record: Record, places: Places) -> dict[str, jax.Array]:
         """Distances of now, and means or extremes of the episode so far."""
-        return {
-            "success": (record.held >= self.hold_steps).astype(places.distance.dtype),
-            "distance": places.distance,
-            "held": record.held * self.config.dt,
-            "height": places.height,
-            "jerk": record.jerk / jnp.maximum(record.steps, 1.0),
-            "limit_violation": record.violation,
-        }
-
-
-def find_length(vector: jax.Array) -> jax.Array:
-    """|x| of a vector `[n]`, whose gradient at 0 is 0."""
-    return jnp.sqrt(jnp.sum(vector**2) + TINY)
+        success = (record.held >= self.hold_steps).astype(places.distance.dtype)
+        metrics = {"success": success, "distance": places.distance, "height": places.height}
+        return metrics | find_record_metrics(record, self.config.dt)
 
 
 # --- the model --------------------------------------------------------------------------------------------------------
 
 
-def set_options(spec: mujoco.MjSpec, timestep: float) -> None:
-    """Sets the time step, with an integrator that is stable for servos, and lets nothing of the robot collide."""
+def set_options(spec: mujoco.MjSpec) -> None:
+    """Sets an integrator that is stable for servos, and lets nothing of the robot collide."""
     import mujoco
 
-    spec.option.timestep = timestep
     spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
     for pair in list(spec.pairs):
         spec.delete(pair)
@@ -506,8 +456,7 @@ def add_fist(spec: mujoco.MjSpec, config: PushConfig) -> tuple[Frame, Area, Plac
     import mujoco
 
     arm = read_arm(spec, config.site)
-    for guess in arm.guesses:
-        logger.warning("%s: %s", arm.name, guess)
+    log_guesses(arm.name, arm.guesses)
     height = config.fist_radius + CLEARANCE + config.fist_length
     frame = find_frame(arm)
     area, pose = find_area(arm, frame, height, config)
@@ -615,7 +564,7 @@ def make_command(
       config: the task's options.
     """
     arm, speeds = control.arm, control.speeds
-    places, dofs = (np.array([getattr(joint, name) for joint in arm.joints]) for name in ("qpos", "dof"))
+    places, dofs = arm.qpos_of, arm.dof_of
     low, high = arm.ranges
     look = compile_forward(arm.model, outputs=(f"site_xpos[{FIST}]", f"site_jacp[{FIST}]"))
 

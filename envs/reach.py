@@ -24,8 +24,6 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-import logging
-import math
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -34,20 +32,33 @@ import jax.numpy as jnp
 import numpy as np
 from flax import struct
 
-from envs.base import Interface, MjxEnv, State, initial_state
+from envs.base import Interface, State, initial_state
 from envs.options import OptionError, option
 from envs.physics import COLLISION, PHYSICS, compile_forward
 from envs.robots import CONTROLS, load_robot, make_control
 from envs.robots.controls import ControlOptions
 from envs.robots.goals import draw_poses
 from envs.robots.resolved_rate import Controller, make_resolved_rate
+from envs.robots.tasks import (
+    SCALES,
+    Record,
+    RobotEnv,
+    count_hold_steps,
+    divide_step,
+    extend_record,
+    find_length,
+    find_penalty,
+    find_record_metrics,
+    log_guesses,
+    name_actions,
+    name_joints,
+    observe_joints,
+    pull,
+    start_record,
+)
 from envs.scenes import Scene
 
-logger = logging.getLogger(__name__)
-
-TINY = 1e-12  # under a square root, whose gradient at 0 then is 0
-SCALES = (0.05, 0.01)  # at which errors are observed besides [m], and five times that for angles [rad]
-PRECISION, PULL = 0.01, 0.1  # of the logarithm in the precise reward [m or rad]
+ANGLE_SCALES = (0.25, 0.05)  # at which angles are observed besides [rad]
 POSE_NOISE = 0.05  # around the poses that lead to goals [rad or m], so that goals are everywhere between them
 MOTIONS = ("none", "line", "circle")
 
@@ -123,27 +134,6 @@ TRAINING = {
 
 
 @struct.dataclass
-class Record:
-    """What metrics remember of an episode.
-
-    Attributes:
-      steps: since the start.
-      held: for how many steps the present goal has been held.
-      reached: how many goals were held at the end of their time.
-      actions: the last action and the one before `[2, m]`; 0 before the start.
-      jerk: sum over the steps of the mean squared second difference of the actions.
-      violation: how far a joint has been beyond its range at most [rad or m].
-    """
-
-    steps: jax.Array
-    held: jax.Array
-    reached: jax.Array
-    actions: jax.Array
-    jerk: jax.Array
-    violation: jax.Array
-
-
-@struct.dataclass
 class ReachState:
     """The robot's motion, its goals, and the record of the episode.
 
@@ -155,6 +145,7 @@ class ReachState:
       goals: positions `[K, 3]` [m] of the episode's goals, at time 0 if they move.
       rotations: the goals' rotation matrices `[K, 3, 3]`; None without orientations.
       directions: the two perpendicular directions `[2, 3]` of a motion; None if goals rest.
+      reached: how many goals were held at the end of their time.
       record: for metrics.
     """
 
@@ -166,6 +157,7 @@ class ReachState:
     goals: jax.Array
     rotations: jax.Array | None
     directions: jax.Array | None
+    reached: jax.Array
     record: Record
 
 
@@ -185,38 +177,31 @@ class Errors(NamedTuple):
     @property
     def distance(self) -> jax.Array:
         """D = |x_g - x| [m]; its gradient is 0 at the goal itself."""
-        return jnp.sqrt(jnp.sum(self.position**2) + TINY)
+        return find_length(self.position)
 
     @property
     def angle(self) -> jax.Array:
         """Theta in [0, pi] [rad]; 0 without orientation."""
         if self.turn is None or self.cosine is None:
             return jnp.zeros_like(self.distance)
-        return jnp.arctan2(jnp.sqrt(jnp.sum(self.turn**2) + TINY), self.cosine)
+        return jnp.arctan2(find_length(self.turn), self.cosine)
 
 
-class Reach(MjxEnv):
+class Reach(RobotEnv):
     """An arm that reaches; see the module's docstring for its equations."""
 
     def __init__(self, config: ReachConfig = ReachConfig()):
         self.config = config
         spec = load_robot(config.robot)
-        num_substeps = max(1, round(config.dt / spec.option.timestep))
-        spec.option.timestep = config.dt / num_substeps
+        num_substeps = divide_step(spec, config.dt)
         told = ControlOptions(config.control, config.torque, config.speed, config.step, config.dt)
         self.control = make_control(spec, config.site, told)
         self.arm = arm = self.control.arm
-        for guess in arm.guesses:
-            logger.warning("%s: %s", arm.name, guess)
-        self.fields = ("qpos", "qvel", "qacc_warmstart", *(("act",) if arm.model.na else ()))
-        inputs, outputs = (*self.fields, "ctrl"), (*self.fields, "qfrc_actuator")
-        super().__init__(
-            spec, num_substeps, config.physics, False, inputs=inputs, outputs=outputs, collision=config.collision
-        )
+        log_guesses(arm.name, arm.guesses)
+        super().__init__(spec, arm.model, num_substeps, config.physics, config.collision)
         self.place = compile_forward(arm.model, outputs=(f"site_xpos[{arm.site}]", f"site_xmat[{arm.site}]"))
-        self.qpos_of, self.dof_of = (np.array([getattr(x, name) for x in arm.joints]) for name in ("qpos", "dof"))
         self.poses = None if config.goal_box else jnp.asarray(draw_poses(arm), float)
-        self.hold_steps = max(1, math.ceil(config.hold_time / config.dt - 1e-6))
+        self.hold_steps = count_hold_steps(config.hold_time, config.dt)
 
     @property
     def action_size(self) -> int:
@@ -244,9 +229,8 @@ class Reach(MjxEnv):
         shift = jax.random.uniform(key_start, low.shape, minval=-spread, maxval=spread)
         angles = jnp.clip(self.arm.angles + shift, low, high)
         goals, rotations = self._draw_goals(key_goals)
-        zero = jnp.zeros(())
         state = ReachState(
-            qpos=jnp.asarray(self.arm.qpos, float).at[self.qpos_of].set(angles),
+            qpos=jnp.asarray(self.arm.qpos, float).at[self.arm.qpos_of].set(angles),
             qvel=jnp.zeros(model.nv),
             qacc_warmstart=jnp.zeros(model.nv),
             act=self.control.start(angles) if model.na else None,
@@ -254,25 +238,25 @@ class Reach(MjxEnv):
             goals=goals,
             rotations=rotations if self.config.goal == "pose" else None,
             directions=draw_directions(key_motion) if self.config.motion != "none" else None,
-            record=Record(zero, zero, zero, jnp.zeros((2, self.action_size)), zero, zero),
+            reached=jnp.zeros(()),
+            record=start_record(self.action_size),
         )
         errors = self.find_errors(state)
-        return initial_state(state, self.observe(state, errors), tuple(self._find_metrics(state.record, errors)))
+        return initial_state(state, self.observe(state, errors), tuple(self._find_metrics(state, errors)))
 
     def step(self, state: State, action: jax.Array) -> State:
         """One step of `dt` under the command of the action, clipped to [-1, 1]."""
         before, action = state.pipeline_state, jnp.clip(action, -1.0, 1.0)
         ctrl, target = self.control.command(action, before.qpos, before.target)
-        *moved, force = self.physics_step(*(getattr(before, name) for name in self.fields), ctrl)
-        record = before.record.replace(steps=before.record.steps + 1)
-        after = before.replace(target=target, record=record, **dict(zip(self.fields, moved, strict=True)))
+        after, force = self.advance(before, ctrl)
+        after = after.replace(target=target, record=before.record.replace(steps=before.record.steps + 1))
         errors = self.find_errors(after)
-        after = after.replace(record=self._update_record(after, errors, action))
+        after = self._remember(after, errors, action)
         return state.replace(
             pipeline_state=after,
             obs=self.observe(after, errors),
-            reward=self._find_reward(before, action, force[self.dof_of]),
-            metrics=self._find_metrics(after.record, errors),
+            reward=self._find_reward(before, action, force[self.arm.dof_of]),
+            metrics=self._find_metrics(after, errors),
         )
 
     @functools.cached_property
@@ -283,7 +267,7 @@ class Reach(MjxEnv):
     def baseline(self, state: State) -> jax.Array:
         """The action of a textbook controller that knows the model (`envs.robots.resolved_rate`), `[m]`."""
         motion, errors = state.pipeline_state, self.find_errors(state.pipeline_state)
-        turn = None if errors.turn is None else errors.angle * errors.turn / jnp.sqrt(jnp.sum(errors.turn**2) + TINY)
+        turn = None if errors.turn is None else errors.angle * errors.turn / find_length(errors.turn)
         return self._resolved_rate(motion.qpos, motion.qvel, errors.position, turn)
 
     def find_errors(self, state: ReachState) -> Errors:
@@ -312,34 +296,29 @@ class Reach(MjxEnv):
         with e = x_g - x and s = sin(theta) axis; what the options leave out is not there. The errors at smaller scales
         let a network with smooth activations be exact near the goal.
         """
-        config, angles = self.config, state.qpos[self.qpos_of]
-        turning = np.array([not joint.is_slide for joint in self.arm.joints])
-        goal, (_, velocity) = self.find_goal(state), move_goal(state, config)
-        parts = [jnp.cos(angles[turning]), jnp.sin(angles[turning]), angles[~turning], state.qvel[self.dof_of]]
-        parts += [] if state.target is None else [state.target - angles]
+        config, goal, (_, velocity) = self.config, self.find_goal(state), move_goal(state, self.config)
+        parts = observe_joints(self.arm, state)
         parts += [goal, errors.position, *(errors.position / (errors.distance + scale) for scale in SCALES)]
         parts += [] if config.motion == "none" else [velocity]
         if errors.turn is not None and errors.cosine is not None:
-            parts += [errors.turn, errors.cosine[None], *(errors.turn / (errors.angle + 5 * scale) for scale in SCALES)]
+            parts += [
+                errors.turn,
+                errors.cosine[None],
+                *(errors.turn / (errors.angle + scale) for scale in ANGLE_SCALES),
+            ]
         parts += [state.record.actions[0]] if config.lambda_rate else []
         return jnp.concatenate(parts)
 
     def _name_observations(self) -> tuple[str, ...]:
         """The names in the order of `observe`."""
-        config, joints = self.config, self.arm.joints
-        hinges, slides = ([joint.name for joint in joints if joint.is_slide == kind] for kind in (False, True))
-        names = [f"{function}({name})" for function in ("cos", "sin") for name in hinges]
-        names += [f"{name} [m]" for name in slides]
-        names += [f"{joint.name}' [{joint.unit}/s]" for joint in joints]
-        names += [f"{x.name} set-point - position [{x.unit}]" for x in joints] if self.control.has_target else []
+        config, names = self.config, name_joints(self.arm, self.control.has_target)
         names += [f"{what} {axis} [m]" for what in ("goal", "error") for axis in "xyz"]
         names += [f"error {axis} / (distance + {100 * scale:g} cm)" for scale in SCALES for axis in "xyz"]
         names += [] if config.motion == "none" else [f"goal {axis}' [m/s]" for axis in "xyz"]
         if config.goal == "pose":
             names += [*(f"sin(angle) axis {axis}" for axis in "xyz"), "cos(angle)"]
-            names += [f"sin(angle) axis {axis} / (angle + {5 * scale:g} rad)" for scale in SCALES for axis in "xyz"]
-        if config.lambda_rate:
-            names += [f"last {name.partition(' [')[0]} / limit" for name in self.control.names]
+            names += [f"sin(angle) axis {axis} / (angle + {scale:g} rad)" for scale in ANGLE_SCALES for axis in "xyz"]
+        names += name_actions(self.control.names) if config.lambda_rate else []
         return tuple(names)
 
     def _draw_goals(self, key: jax.Array) -> tuple[jax.Array, jax.Array]:
@@ -353,7 +332,7 @@ class Reach(MjxEnv):
         poses = self.poses[jax.random.randint(key_pose, (number,), 0, len(self.poses))]
         poses += jax.random.uniform(key_noise, poses.shape, minval=-POSE_NOISE, maxval=POSE_NOISE)
         qpos = jnp.broadcast_to(jnp.asarray(self.arm.qpos, float), (number, self.arm.model.nq))
-        positions, rotations = jax.vmap(self.place)(qpos.at[:, self.qpos_of].set(poses))
+        positions, rotations = jax.vmap(self.place)(qpos.at[:, self.arm.qpos_of].set(poses))
         return positions, rotations.reshape(number, 3, 3)
 
     def _find_reward(self, state: ReachState, action: jax.Array, torque: jax.Array) -> jax.Array:
@@ -364,30 +343,18 @@ class Reach(MjxEnv):
             cost = config.lambda_pos * distance**2 + config.lambda_angle * angle**2
         else:
             cost = config.lambda_pos * (distance**2 + pull(distance)) + config.lambda_angle * pull(angle)
-        low, high = self.arm.ranges
-        angles, margin = state.qpos[self.qpos_of], config.limit_margin
-        near = jnp.maximum(0.0, jnp.maximum(low + margin - angles, angles - high + margin))
-        penalty = config.lambda_torque * jnp.sum(torque**2)
-        penalty += config.lambda_velocity * jnp.sum(state.qvel[self.dof_of] ** 2)
-        penalty += config.lambda_rate * jnp.sum((action - state.record.actions[0]) ** 2)
-        penalty += config.lambda_limit * jnp.sum(near**2)
-        return -cost - penalty
+        return -cost - find_penalty(config, self.arm, state, torque, action, state.record.actions[0])
 
-    def _update_record(self, state: ReachState, errors: Errors, action: jax.Array) -> Record:
-        """The record after a step, whose number of steps is that of `state` already, under an action."""
-        config, (low, high), record = self.config, self.arm.ranges, state.record
-        angles = state.qpos[self.qpos_of]
-        excess = jnp.max(jnp.maximum(low - angles, angles - high), initial=0.0)
+    def _remember(self, state: ReachState, errors: Errors, action: jax.Array) -> ReachState:
+        """The state with the record of a step, whose number of steps it has already, under an action."""
+        config, record = self.config, state.record
         is_there = (errors.distance < config.success_radius) & (errors.angle < config.success_angle)
         is_new = self._find_part(record.steps) != self._find_part(record.steps - 1)
-        last, before = record.actions
+        held = jnp.where(is_there, jnp.where(is_new, 0.0, record.held) + 1.0, 0.0)
         return dataclasses.replace(
-            record,
-            held=jnp.where(is_there, jnp.where(is_new, 0.0, record.held) + 1.0, 0.0),
-            reached=record.reached + jnp.where(is_new & self._is_held(record.held), 1.0, 0.0),
-            actions=jnp.stack([action, last]),
-            jerk=record.jerk + jnp.mean((action - 2 * last + before) ** 2),
-            violation=jnp.maximum(record.violation, excess),
+            state,
+            reached=state.reached + jnp.where(is_new & self._is_held(record.held), 1.0, 0.0),
+            record=extend_record(record, self.arm, state.qpos[self.arm.qpos_of], held, action),
         )
 
     def _find_part(self, steps: jax.Array) -> jax.Array:
@@ -398,24 +365,14 @@ class Reach(MjxEnv):
     def _is_held(self, held: jax.Array) -> jax.Array:
         return held >= self.hold_steps
 
-    def _find_metrics(self, record: Record, errors: Errors) -> dict[str, jax.Array]:
+    def _find_metrics(self, state: ReachState, errors: Errors) -> dict[str, jax.Array]:
         """Distances of now, and means or extremes of the episode so far."""
-        reached = record.reached + self._is_held(record.held)
-        success = reached >= self.config.goals
-        metrics = {
-            "success": success.astype(errors.distance.dtype),
-            "distance": errors.distance,
-            "held": record.held * self.config.dt,
-            "jerk": record.jerk / jnp.maximum(record.steps, 1.0),
-            "limit_violation": record.violation,
-        }
+        reached = state.reached + self._is_held(state.record.held)
+        success = (reached >= self.config.goals).astype(errors.distance.dtype)
+        metrics = {"success": success, "distance": errors.distance}
+        metrics |= find_record_metrics(state.record, self.config.dt)
         metrics |= {} if errors.turn is None else {"angle": errors.angle}
         return metrics | ({"reached": reached} if self.config.goals > 1 else {})
-
-
-def pull(error: jax.Array) -> jax.Array:
-    """f(x) = x + 0.1 log(1 + x / 0.01) of a distance [m] or an angle [rad]."""
-    return error + PULL * jnp.log1p(error / PRECISION)
 
 
 def move_goal(state: ReachState, config: ReachConfig) -> tuple[jax.Array, jax.Array]:

@@ -36,11 +36,13 @@ import jax.numpy as jnp
 import numpy as np
 from flax import struct
 
-from envs.base import Interface, MjxEnv, State, initial_state
+from envs.base import Interface, State, initial_state
 from envs.options import OptionError, option
 from envs.physics import PHYSICS, compile_forward
 from envs.robots.legs import CONTACTS, LegOptions, read_legs
+from envs.robots.quaternions import find_down, rotate_back, turn_about_z
 from envs.robots.sources import load_robot
+from envs.robots.tasks import RobotEnv, divide_step, find_jerk
 
 SHIPPED = ("quadruped",)
 LANDED = 0.005  # a foot lower than this is on the ground [m]
@@ -185,20 +187,17 @@ class Motion(NamedTuple):
     down: jax.Array
 
 
-class Walk(MjxEnv):
+class Walk(RobotEnv):
     """A robot that walks as commanded; see the module's docstring for its equations."""
 
     def __init__(self, config: WalkConfig = WalkConfig()):
         self.config = config
         spec = load_robot(config.robot, SHIPPED)
-        num_substeps = max(1, round(config.dt / spec.option.timestep))
-        spec.option.timestep = config.dt / num_substeps
+        num_substeps = divide_step(spec, config.dt)
         self.robot = robot = read_legs(spec, LegOptions(config.stiffness, config.damping, config.contacts))
-        self.fields = ("qpos", "qvel", "qacc_warmstart", *(("act",) if robot.model.na else ()))
-        inputs, outputs = (*self.fields, "ctrl"), (*self.fields, "qfrc_actuator")
-        super().__init__(spec, num_substeps, config.physics, False, inputs=inputs, outputs=outputs)
+        super().__init__(spec, robot.model, num_substeps, config.physics)
         self.find_feet = compile_forward(robot.model, outputs=tuple(f"site_xpos[{site}]" for site in robot.feet))
-        self.qpos_of, self.dof_of = (np.array([getattr(x, name) for x in robot.joints]) for name in ("qpos", "dof"))
+        self.qpos_of, self.dof_of = robot.qpos_of, robot.dof_of
         self.angles, base = robot.qpos[self.qpos_of], robot.base_qpos
         self.stand_down = np.asarray(find_down(jnp.asarray(robot.qpos[base + 3 : base + 7])))
         self.low, self.high = _find_set_point_ranges(robot.joints)
@@ -231,9 +230,7 @@ class Walk(MjxEnv):
         """One step of `dt` with the set-points of the action, clipped to [-1, 1]."""
         before, action = state.pipeline_state, jnp.clip(action, -1.0, 1.0)
         set_points = jnp.clip(self.robot.set_points + self.config.scale * action, self.low, self.high)
-        ctrl = self.robot.find_controls(set_points)
-        *moved, force = self.physics_step(*(getattr(before, name) for name in self.fields), ctrl)
-        after = before.replace(**dict(zip(self.fields, moved, strict=True)))
+        after, force = self.advance(before, self.robot.find_controls(set_points))
         torque, fallen = force[self.dof_of], self.has_fallen(after)
         after = after.replace(record=self._update_record(before, after, action, torque))
         return state.replace(
@@ -329,10 +326,9 @@ class Walk(MjxEnv):
 
     def _find_leg_penalty(self, state: WalkState) -> jax.Array:
         """Penalties of actions and joints."""
-        config, (low, high) = self.config, self.robot.ranges
-        angles, margin = state.qpos[self.qpos_of], config.limit_margin
+        config, angles = self.config, state.qpos[self.qpos_of]
         last, before = state.record.actions
-        near = jnp.maximum(0.0, jnp.maximum(low + margin - angles, angles - high + margin))
+        near = self.robot.find_nearness(angles, config.limit_margin)
         penalty = config.lambda_rate * jnp.sum((last - before) ** 2) + config.lambda_limit * jnp.sum(near**2)
         return penalty + config.lambda_pose * jnp.sum((angles - self.angles) ** 2)
 
@@ -353,12 +349,11 @@ class Walk(MjxEnv):
         late, latest = steps > self.half, steps > self.config.episode_length - self.last
         error, turn_error = self._find_errors(before, motion)
         speed = jnp.sqrt(jnp.sum(error**2))
-        last, previous = record.actions
         height = after.qpos[self.robot.base_qpos + 2] - self.robot.floor
         is_up = self._find_heights(feet) > LANDED
         return Record(
             steps=steps,
-            actions=jnp.stack([action, last]),
+            actions=jnp.stack([action, record.actions[0]]),
             feet=feet,
             air=jnp.where(is_up, record.air + self.config.dt, 0.0),
             errors=record.errors + late * jnp.stack([speed, jnp.abs(turn_error)]),
@@ -366,7 +361,7 @@ class Walk(MjxEnv):
             height=record.height + late * height,
             torque=record.torque + jnp.mean(jnp.abs(torque)),
             power=record.power + jnp.sum(jnp.abs(torque * after.qvel[self.dof_of])),
-            jerk=record.jerk + jnp.mean((action - 2 * last + previous) ** 2),
+            jerk=record.jerk + find_jerk(action, record.actions),
         )
 
     def _find_metrics(self, state: WalkState, fallen: jax.Array) -> dict[str, jax.Array]:
@@ -408,23 +403,3 @@ def _find_set_point_ranges(joints) -> tuple[np.ndarray, np.ndarray]:
     """(lowest, highest) set-points [n]: those of the servos' controls."""
     low, high = np.array([joint.drive.quantity_range() for joint in joints]).T
     return low, high
-
-
-def find_down(quaternion: jax.Array) -> jax.Array:
-    """R^T (0, 0, -1) of a unit quaternion (w, x, y, z): the direction of gravity in the base's frame `[3]`."""
-    w, x, y, z = quaternion
-    return -jnp.stack([2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x**2 + y**2)])
-
-
-def rotate_back(quaternion: jax.Array, vector: jax.Array) -> jax.Array:
-    """R^T v of a unit quaternion (w, x, y, z) and a vector `[3]`: v + 2 w (v x u) + 2 (v x u) x u, u = (x, y, z)."""
-    axis = quaternion[1:]
-    cross = jnp.cross(vector, axis)
-    return vector + 2 * (quaternion[0] * cross + jnp.cross(cross, axis))
-
-
-def turn_about_z(angle: jax.Array, quaternion: jax.Array) -> jax.Array:
-    """The quaternion of a rotation that is followed by a turn about the world's z axis."""
-    cos, sin = jnp.cos(angle / 2), jnp.sin(angle / 2)
-    w, x, y, z = quaternion
-    return jnp.stack([cos * w - sin * z, cos * x - sin * y, cos * y + sin * x, cos * z + sin * w])

@@ -1,16 +1,13 @@
 """Driving to a pose: what is read from a robot, errors, rewards, falls, the textbook's controller, and C MuJoCo."""
 
-import atexit
 import functools
-import shutil
-import tempfile
-from pathlib import Path
 
 import jax
 import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
+from robot_files import jit, start, write
 
 import envs
 from envs.drive import TEXTBOOK_RETURN, Errors, find_errors, find_square, find_way
@@ -35,31 +32,14 @@ def describe(parts=RIGHT + LEFT + CASTER, free="<freejoint/>", actuators=MOTORS)
 
 
 @functools.cache
-def write(text):
-    folder = Path(tempfile.mkdtemp())
-    atexit.register(shutil.rmtree, folder)
-    (folder / "robot.xml").write_text(text)
-    return str(folder / "robot.xml")
-
-
-@functools.cache
 def make(**options):
     """By C MuJoCo, which needs no compiling, unless the options say otherwise."""
     return envs.make("drive", **{"physics": "mujoco", **options})
 
 
 @functools.cache
-def jit(env, name):
-    return jax.jit(getattr(env, name))
-
-
-@functools.cache
 def jit_batch(env, name):
     return jax.jit(jax.vmap(getattr(env, name)))
-
-
-def start(env, seed=0):
-    return jit(env, "reset")(jax.random.key(seed))
 
 
 def put(state, **values):

@@ -1,16 +1,13 @@
 """Pushing with any arm: the added table, object and fist, frames, rewards, starts, and the way through C MuJoCo."""
 
-import atexit
 import functools
-import shutil
-import tempfile
-from pathlib import Path
 
 import jax
 import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
+from robot_files import jit, start, write
 from scipy.spatial.transform import Rotation
 
 import envs
@@ -43,26 +40,9 @@ SERVOS = ARM.format(
 
 
 @functools.cache
-def write(text):
-    folder = Path(tempfile.mkdtemp())
-    atexit.register(shutil.rmtree, folder)
-    (folder / "robot.xml").write_text(text)
-    return str(folder / "robot.xml")
-
-
-@functools.cache
 def make(**options):
     """Stepped by C MuJoCo, which needs no compiler, unless a test compares it with the equations."""
     return envs.make("push", **{"robot": write(MOTORS), "physics": "mujoco", **options})
-
-
-@functools.cache
-def jit(env, name):
-    return jax.jit(getattr(env, name))
-
-
-def start(env, seed=0):
-    return jit(env, "reset")(jax.random.key(seed))
 
 
 def move(env, state, **fields):

@@ -1,17 +1,14 @@
 """Reaching with any arm: goals, errors, rewards, what an episode remembers, and the way through C MuJoCo."""
 
-import atexit
 import dataclasses
 import functools
-import shutil
-import tempfile
-from pathlib import Path
 
 import jax
 import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
+from robot_files import jit, start, write
 from scipy.spatial.transform import Rotation
 
 import envs
@@ -58,25 +55,8 @@ BOX = (0.3, -0.2, 0.4, 0.5, 0.2, 0.6)
 
 
 @functools.cache
-def write(text):
-    folder = Path(tempfile.mkdtemp())
-    atexit.register(shutil.rmtree, folder)
-    (folder / "robot.xml").write_text(text)
-    return str(folder / "robot.xml")
-
-
-@functools.cache
 def make(**options):
     return envs.make("reach", **{"robot": write(ARM), **options})
-
-
-def start(env, seed=0):
-    return jit(env, "reset")(jax.random.key(seed))
-
-
-@functools.cache
-def jit(env, name):
-    return jax.jit(getattr(env, name))
 
 
 def test_error_is_from_mujocos_site_to_the_goal():

@@ -1,17 +1,14 @@
 """Walking: what is read of a legged robot, body-frame quantities, rewards, falls, commands, and C MuJoCo's motion."""
 
-import atexit
 import dataclasses
 import functools
-import shutil
-import tempfile
-from pathlib import Path
 
 import jax
 import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
+from robot_files import jit, start, write
 from scipy.spatial.transform import Rotation
 
 import envs
@@ -19,8 +16,8 @@ from envs.base import ASSETS
 from envs.options import OptionError
 from envs.physics import candidate_pairs, compile_model, load_spec
 from envs.robots.legs import LegOptions, read_legs
+from envs.robots.quaternions import find_down, rotate_back, turn_about_z
 from envs.robots.sources import load_robot
-from envs.walk import find_down, rotate_back, turn_about_z
 
 LEG = """<body name="{name}" pos="{x} {y} 0"><joint name="{name}" axis="0 1 0" range="-1 1" armature="0.01"/>
   <geom type="capsule" fromto="0 0 0 0 0 -0.2" size="0.015" mass="0.2"/>
@@ -44,14 +41,6 @@ def describe_robot(floor=FLOOR, actuator=SERVO, keys=KEYS, legs=LEGS, kp=40):
     return ROBOT.format(floor=floor, legs=legs, actuators=actuators, keys=keys)
 
 
-@functools.cache
-def write(text):
-    folder = Path(tempfile.mkdtemp())
-    atexit.register(shutil.rmtree, folder)
-    (folder / "robot.xml").write_text(text)
-    return str(folder / "robot.xml")
-
-
 def make(robot=describe_robot(), **options):
     return _make(robot, tuple((name, tuple(x) if isinstance(x, list) else x) for name, x in sorted(options.items())))
 
@@ -60,15 +49,6 @@ def make(robot=describe_robot(), **options):
 def _make(robot, pairs):
     options = {name: list(x) if isinstance(x, tuple) else x for name, x in pairs}
     return envs.make("walk", **{"robot": write(robot), "physics": "mujoco", **options})
-
-
-@functools.cache
-def jit(env, name):
-    return jax.jit(getattr(env, name))
-
-
-def start(env, seed=0):
-    return jit(env, "reset")(jax.random.key(seed))
 
 
 def put(state, **fields):

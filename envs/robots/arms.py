@@ -9,6 +9,8 @@ import re
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, NoReturn
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 
 from envs.options import OptionError, describe_unknown
@@ -63,8 +65,34 @@ class ArmJoint:
         return "m" if self.is_slide else "rad"
 
 
+class Jointed:
+    """What follows from a robot's `joints`."""
+
+    joints: tuple[ArmJoint, ...]
+
+    @property
+    def qpos_of(self) -> np.ndarray:
+        """Where the joints' positions are in qpos [n]."""
+        return np.array([joint.qpos for joint in self.joints])
+
+    @property
+    def dof_of(self) -> np.ndarray:
+        """Where the joints' velocities are in qvel [n]."""
+        return np.array([joint.dof for joint in self.joints])
+
+    @property
+    def ranges(self) -> tuple[np.ndarray, np.ndarray]:
+        """(lowest, highest) positions of the joints [n]."""
+        return np.array([joint.low for joint in self.joints]), np.array([joint.high for joint in self.joints])
+
+    def find_nearness(self, angles: jax.Array, margin: float) -> jax.Array:
+        """How far each joint is within a margin of the ends of its range `[n]`, for positions `[n]` [rad or m]."""
+        low, high = self.ranges
+        return jnp.maximum(0.0, jnp.maximum(low + margin - angles, angles - high + margin))
+
+
 @dataclass(frozen=True)
-class Arm:
+class Arm(Jointed):
     """What is read from the model of an arm.
 
     Attributes:
@@ -88,12 +116,7 @@ class Arm:
     @property
     def angles(self) -> np.ndarray:
         """The joints' positions at rest [n]."""
-        return self.qpos[[joint.qpos for joint in self.joints]]
-
-    @property
-    def ranges(self) -> tuple[np.ndarray, np.ndarray]:
-        """(lowest, highest) positions of the joints [n]."""
-        return np.array([joint.low for joint in self.joints]), np.array([joint.high for joint in self.joints])
+        return self.qpos[self.qpos_of]
 
 
 def read_arm(spec: mujoco.MjSpec, site: str = "") -> Arm:
@@ -188,19 +211,12 @@ def _list_ancestors(model, body: int) -> list[int]:
 
 
 def _is_arm_joint(model, joint: int) -> bool:
-    drive = _drive_of(model, joint)
+    drive = read_drive(model, joint)
     if drive is None:
         return False
     return not (
         GRIPPER_NAMES.search(model.joint(joint).name) or GRIPPER_NAMES.search(model.actuator(drive.actuator).name)
     )
-
-
-def _drive_of(model, joint: int) -> Drive | None:
-    import mujoco
-
-    kinds = (int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_SLIDE))
-    return read_drive(model, joint) if model.jnt_type[joint] in kinds else None
 
 
 def _find_last_body(model) -> int:
@@ -289,33 +305,31 @@ def _find_joints(model, body: int) -> tuple[ArmJoint, ...]:
     if balls:
         line = f"ball joint '{model.joint(balls[0]).name}' carries the end effector, and arms have hinges and slides"
         raise OptionError([f"env.robot: {line}; write it as three hinges, or choose a site before it with env.site"])
-    joints = [joint for joint in path if _drive_of(model, joint)]
+    joints = [joint for joint in path if read_drive(model, joint)]
     if not joints:
         raise OptionError([f"env.site: no joint with an actuator carries body '{model.body(int(body)).name}'"])
     return tuple(_read_joint(model, joint) for joint in joints)
 
 
 def _read_joint(model, joint: int) -> ArmJoint:
-    import mujoco
-
-    drive = read_drive(model, joint)
+    drive, name = read_drive(model, joint), model.joint(joint).name
     assert drive is not None
-    name = model.joint(joint).name
     if drive.kind == "other":
         line = f"actuator '{model.actuator(drive.actuator).name}' of joint '{name}'"
         line += " has gear 0" if not drive.gear else " is neither a motor nor a servo"
         advice = f'a motor or a servo for position or velocity, such as <motor joint="{name}" ctrlrange="-10 10"/>'
         raise OptionError([f"env.robot: {line}; an arm needs {advice}"])
+    return make_joint(model, joint, drive)
+
+
+def make_joint(model: mujoco.MjModel, joint: int, drive: Drive) -> ArmJoint:
+    """A hinge or slide with its actuator, as the model has it."""
+    import mujoco
+
     low, high = model.jnt_range[joint] if model.jnt_limited[joint] else (-np.inf, np.inf)
-    return ArmJoint(
-        name,
-        int(model.jnt_qposadr[joint]),
-        int(model.jnt_dofadr[joint]),
-        bool(model.jnt_type[joint] == int(mujoco.mjtJoint.mjJNT_SLIDE)),
-        float(low),
-        float(high),
-        drive,
-    )
+    is_slide = bool(model.jnt_type[joint] == int(mujoco.mjtJoint.mjJNT_SLIDE))
+    places = int(model.jnt_qposadr[joint]), int(model.jnt_dofadr[joint])
+    return ArmJoint(model.joint(joint).name, *places, is_slide, float(low), float(high), drive)
 
 
 def _describe_loose_joints(model, body: int) -> list[str]:
@@ -325,7 +339,7 @@ def _describe_loose_joints(model, body: int) -> list[str]:
     path = find_path(model, int(body))
     active = (model.eq_type == int(mujoco.mjtEq.mjEQ_JOINT)) & model.eq_active0.astype(bool)
     tied = [joint for joint in path if joint in model.eq_obj1id[active]]
-    loose = [joint for joint in path if joint not in tied and not _drive_of(model, joint)]
+    loose = [joint for joint in path if joint not in tied and not read_drive(model, joint)]
     names = {joint: model.joint(joint).name for joint in path}
     return [
         *(
@@ -336,8 +350,8 @@ def _describe_loose_joints(model, body: int) -> list[str]:
     ]
 
 
-def _find_keyframe(model) -> int | None:
-    """The keyframe of the pose at rest: one called so, or the first."""
+def find_keyframe(model: mujoco.MjModel) -> int | None:
+    """The keyframe of the pose at rest: one called home, rest or ready, or the first; None without any."""
     names = [model.key(i).name.lower() for i in range(model.nkey)]
     return next((names.index(name) for name in REST_NAMES if name in names), 0 if names else None)
 
@@ -345,7 +359,7 @@ def _find_keyframe(model) -> int | None:
 def _reset(model, data) -> None:
     import mujoco
 
-    key = _find_keyframe(model)
+    key = find_keyframe(model)
     if key is None:
         mujoco.mj_resetData(model, data)
     else:
@@ -362,7 +376,7 @@ def find_rest(model: mujoco.MjModel) -> tuple[np.ndarray, np.ndarray, np.ndarray
     data = mujoco.MjData(model)
     _reset(model, data)
     ctrl = data.ctrl.copy()
-    if _find_keyframe(model) is None:
+    if find_keyframe(model) is None:
         ctrl = np.where(model.actuator_ctrllimited.astype(bool), model.actuator_ctrlrange.mean(1), 0.0)
     return data.qpos.copy(), data.act.copy(), ctrl
 
@@ -375,7 +389,7 @@ def _find_arm_rest(
     Controls of the arm itself are of no account.
     """
     qpos, act, ctrl = find_rest(model)
-    if _find_keyframe(model) is None:
+    if find_keyframe(model) is None:
         for joint in joints:
             if np.isfinite(joint.low):
                 qpos[joint.qpos] = (joint.low + joint.high) / 2

@@ -30,8 +30,8 @@ import numpy as np
 
 from envs.options import OptionError
 from envs.physics import compile_forward, scalarize
-from envs.robots.arms import Arm, read_arm
-from envs.robots.drives import NAMES
+from envs.robots.arms import Arm, ArmJoint, read_arm
+from envs.robots.drives import MOTOR_ADVICE, NAMES, change_servo, check_torque, make_writer
 from envs.robots.twists import damped_least_squares, limit_velocities
 
 if TYPE_CHECKING:
@@ -140,23 +140,11 @@ def _change_motors(spec, arm: Arm, control: str) -> Arm:
         inertia = find_effective_inertia(arm)
         for i, joint in enumerate(arm.joints):
             if joint.drive.kind == "motor":
-                _make_servo(spec, arm, i, control, inertia[i])
+                _check_torque(joint)
+                actuator = spec.actuator(arm.model.actuator(joint.drive.actuator).name)
+                change_servo(actuator, joint.drive, *_find_gains(control, inertia[i]))
     changed = read_arm(spec, arm.site)
     return replace(changed, guesses=arm.guesses)
-
-
-def _make_servo(spec, arm: Arm, i: int, control: str, inertia: float) -> None:
-    joint = arm.joints[i]
-    actuator = spec.actuator(arm.model.actuator(joint.drive.actuator).name)
-    gear = joint.drive.gear
-    force = np.sort(np.array(_check_torque(joint)) / gear)
-    if control == "position":
-        actuator.set_to_position(kp=inertia * FREQUENCY**2 / gear**2, kv=2 * inertia * FREQUENCY / gear**2)
-        actuator.ctrllimited = False
-    else:
-        actuator.set_to_velocity(kv=inertia / TIME_CONSTANT / gear**2)
-        actuator.ctrllimited = False
-    actuator.forcelimited, actuator.forcerange = True, force
 
 
 def find_effective_inertia(arm: Arm) -> np.ndarray:
@@ -171,12 +159,15 @@ def find_effective_inertia(arm: Arm) -> np.ndarray:
     return np.array([1 / inverse[joint.dof, joint.dof] for joint in arm.joints])
 
 
-def _check_torque(joint) -> tuple[float, float]:
-    low, high = joint.drive.torque
-    if not low < 0 < high or not np.isfinite(low + high):
-        line = f"the torque of joint '{joint.name}' is not limited on both sides ({low:g} to {high:g})"
-        raise OptionError([f'env.robot: {line}; give its motor a range, such as ctrlrange="-10 10"'])
-    return low, high
+def _find_gains(control: str, inertia: float) -> tuple[float, float]:
+    """(kp, kv) of the servo that a motor becomes; see the module."""
+    if control == "position":
+        return inertia * FREQUENCY**2, 2 * inertia * FREQUENCY
+    return 0.0, inertia / TIME_CONSTANT
+
+
+def _check_torque(joint: ArmJoint) -> tuple[float, float]:
+    return check_torque(joint.drive, f"joint '{joint.name}'", MOTOR_ADVICE)
 
 
 def _find_speeds(arm: Arm, options: ControlOptions) -> np.ndarray:
@@ -233,7 +224,7 @@ def _command_position(arm: Arm, options: ControlOptions) -> Control:
     """c of the positions q* = q + step a, within the ranges."""
     speeds = _find_speeds(arm, options)
     low, high = _find_target_ranges(arm)
-    places = np.array([joint.qpos for joint in arm.joints])
+    places = arm.qpos_of
     servo = np.array([joint.drive.kind == "position" for joint in arm.joints])
     write = _make_writer(arm)
 
@@ -251,7 +242,7 @@ def _command_twist(arm: Arm, options: ControlOptions) -> Control:
     """c of the velocities that give the end effector the twist V = limit a."""
     limits, speeds = np.array(TWIST), _find_speeds(arm, options)
     low, high = arm.ranges
-    places, dofs = (np.array([getattr(joint, name) for joint in arm.joints]) for name in ("qpos", "dof"))
+    places, dofs = arm.qpos_of, arm.dof_of
     jacobians = compile_forward(arm.model, outputs=(f"site_jacp[{arm.site}]", f"site_jacr[{arm.site}]"))
     follow = _make_follower(arm, options.dt)
 
@@ -300,14 +291,4 @@ def _find_target_ranges(arm: Arm) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _make_writer(arm: Arm) -> Callable[[jax.Array], jax.Array]:
-    """Turns torques, positions or velocities [n] into the controls of all actuators [nu]; the others keep their own."""
-    drives = [joint.drive for joint in arm.joints]
-    scale = np.array([drive.control_of(1.0) - drive.control_of(0.0) for drive in drives])
-    offset = np.array([drive.control_of(0.0) for drive in drives])
-    numbers = np.array([drive.actuator for drive in drives])
-    rest = jnp.asarray(arm.ctrl)
-
-    def write(quantity):
-        return rest.at[numbers].set(scale * quantity + offset)
-
-    return write
+    return make_writer([joint.drive for joint in arm.joints], arm.ctrl)

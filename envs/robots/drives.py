@@ -13,15 +13,21 @@ Source: MuJoCo's documentation, "Computation: actuation model".
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
+import jax
+import jax.numpy as jnp
 import numpy as np
+
+from envs.options import OptionError
 
 if TYPE_CHECKING:
     import mujoco
 
 KINDS = ("motor", "position", "velocity")
+MOTOR_ADVICE = 'give its motor a range, such as ctrlrange="-10 10"'
 NAMES = {"motor": "motors", "position": "position servos", "velocity": "velocity servos"}
 
 
@@ -71,9 +77,14 @@ class Drive:
 
 
 def read_drive(model: mujoco.MjModel, joint: int) -> Drive | None:
-    """The actuator that drives a hinge or slide joint alone, read from the compiled model; None if there is none."""
+    """The actuator that drives a hinge or slide joint alone, read from the compiled model; None if there is none.
+
+    Free joints and ball joints are driven by none.
+    """
     import mujoco
 
+    if model.jnt_type[joint] not in (int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_SLIDE)):
+        return None
     kinds = (int(mujoco.mjtTrn.mjTRN_JOINT), int(mujoco.mjtTrn.mjTRN_JOINTINPARENT))
     drives = [
         _read(model, actuator, joint)
@@ -82,6 +93,56 @@ def read_drive(model: mujoco.MjModel, joint: int) -> Drive | None:
     ]
     known = [drive for drive in drives if drive.kind in KINDS]
     return next(iter(known or drives), None)
+
+
+def check_torque(drive: Drive, what: str, advice: str) -> tuple[float, float]:
+    """The (lowest, highest) torque; raises OptionError if it is not limited on both sides of 0.
+
+    Args:
+      drive: of the joint.
+      what: the joint, such as "joint 'elbow'".
+      advice: what would be right.
+    """
+    low, high = drive.torque
+    if not low < 0 < high or not np.isfinite(low + high):
+        line = f"the torque of {what} is not limited on both sides ({low:g} to {high:g})"
+        raise OptionError([f"env.robot: {line}; {advice}"])
+    return low, high
+
+
+def make_writer(drives: Sequence[Drive], rest: np.ndarray) -> Callable[[jax.Array], jax.Array]:
+    """Turns torques, angles or speeds `[n]`, whichever each drive is for, into the controls of all actuators `[nu]`.
+
+    Args:
+      drives: of the joints that are commanded.
+      rest: the controls `[nu]` that other actuators keep.
+    """
+    offset = np.array([drive.control_of(0.0) for drive in drives])
+    scale = np.array([drive.control_of(1.0) for drive in drives]) - offset
+    numbers, kept = np.array([drive.actuator for drive in drives]), jnp.asarray(rest, float)
+
+    def write(quantity):
+        return kept.at[numbers].set(scale * quantity + offset)
+
+    return write
+
+
+def change_servo(actuator: Any, drive: Drive, stiffness: float, damping: float) -> None:
+    """Makes a servo of an actuator: for positions, or with a stiffness of 0 for velocities. It keeps its torque limits.
+
+    Args:
+      actuator: of the specification.
+      drive: what it is in the compiled model.
+      stiffness, damping: of the joint [N m/rad, N m s/rad].
+    """
+    if stiffness:
+        actuator.set_to_position(kp=stiffness / drive.gear**2, kv=damping / drive.gear**2)
+    else:
+        actuator.set_to_velocity(kv=damping / drive.gear**2)
+    actuator.ctrllimited = False
+    force = np.sort(np.array(drive.torque) / drive.gear)
+    if np.isfinite(force).all():
+        actuator.forcelimited, actuator.forcerange = True, force
 
 
 def _read(model: mujoco.MjModel, actuator: int, joint: int) -> Drive:

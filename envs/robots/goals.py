@@ -71,7 +71,7 @@ def _make_judge(arm: Arm) -> Callable[[np.ndarray], bool]:
     """Whether joint positions `[n]` are a possible pose, see `draw_poses`."""
     import mujoco
 
-    data, places = mujoco.MjData(arm.model), [joint.qpos for joint in arm.joints]
+    data, places = mujoco.MjData(arm.model), arm.qpos_of
     data.qpos[:] = arm.qpos
     lowest, touching = _place(arm, data), _find_overlaps(data)
     floor = CLEARANCE * _find_reach(arm, data) if lowest >= 0 else -np.inf

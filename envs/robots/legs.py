@@ -14,14 +14,13 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, NamedTuple
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
 from envs.options import OptionError
 from envs.physics import compile_model
 from envs.physics.models import model_name
-from envs.robots.arms import REST_NAMES, ArmJoint, check_numbers, find_path
-from envs.robots.drives import read_drive
+from envs.robots.arms import ArmJoint, Jointed, check_numbers, find_keyframe, find_path, make_joint
+from envs.robots.drives import MOTOR_ADVICE, change_servo, check_torque, make_writer, read_drive
 
 if TYPE_CHECKING:
     import mujoco
@@ -48,7 +47,7 @@ class LegOptions(NamedTuple):
 
 
 @dataclass(frozen=True)
-class LeggedRobot:
+class LeggedRobot(Jointed):
     """What is read from the model of a legged robot.
 
     Attributes:
@@ -83,18 +82,9 @@ class LeggedRobot:
         """Height of the base over the ground when the robot stands [m]."""
         return float(self.qpos[self.base_qpos + 2]) - self.floor
 
-    @property
-    def ranges(self) -> tuple[np.ndarray, np.ndarray]:
-        """(lowest, highest) positions of the joints [n]."""
-        return np.array([joint.low for joint in self.joints]), np.array([joint.high for joint in self.joints])
-
     def find_controls(self, set_points: jax.Array) -> jax.Array:
         """Controls of all actuators `[nu]` for set-points of the joints `[n]`; other actuators keep the keyframe's."""
-        drives = [joint.drive for joint in self.joints]
-        offset = np.array([drive.control_of(0.0) for drive in drives])
-        slope = np.array([drive.control_of(1.0) for drive in drives]) - offset
-        numbers = np.array([drive.actuator for drive in drives])
-        return jnp.asarray(self.ctrl, set_points.dtype).at[numbers].set(slope * set_points + offset)
+        return make_writer([joint.drive for joint in self.joints], self.ctrl)(set_points)
 
 
 def read_legs(spec: mujoco.MjSpec, options: LegOptions = LegOptions()) -> LeggedRobot:
@@ -120,7 +110,7 @@ def read_legs(spec: mujoco.MjSpec, options: LegOptions = LegOptions()) -> Legged
         spec.body(model.body(body).name).add_site(name=_name_site(model, body), pos=model.geom_pos[geoms].mean(0))
     robot = _describe(spec, model, base, list(feet), key, floor)
     has_servos = all(joint.drive.kind == "position" for joint in joints) and data.ctrl.any()
-    return robot if has_servos else replace(robot, set_points=robot.qpos[[joint.qpos for joint in joints]])
+    return robot if has_servos else replace(robot, set_points=robot.qpos[robot.qpos_of])
 
 
 def _describe(spec, before, base: int, feet: list[int], key: int, floor: float) -> LeggedRobot:
@@ -150,11 +140,11 @@ def _describe(spec, before, base: int, feet: list[int], key: int, floor: float) 
 
 
 def _find_keyframe(model) -> int:
-    """The keyframe in which the robot stands: one called home, rest or ready, or the first."""
-    names = [model.key(i).name.lower() for i in range(model.nkey)]
-    if not names:
+    """The keyframe in which the robot stands."""
+    key = find_keyframe(model)
+    if key is None:
         raise OptionError([f"env.robot: the model has no keyframe in which the robot stands; add {KEYFRAME}"])
-    return next((names.index(name) for name in REST_NAMES if name in names), 0)
+    return key
 
 
 def _place(model, key: int, lift: float = 0.0, address: int = 0):
@@ -179,20 +169,13 @@ def _find_base(model) -> int:
     free = [int(model.jnt_bodyid[i]) for i in range(model.njnt) if model.jnt_type[i] == mujoco.mjtJoint.mjJNT_FREE]
     if not free:
         raise OptionError(["env.robot: no body moves freely; walk is for robots with a <freejoint/> (env=reach: arms)"])
-    moved = {int(model.body_rootid[model.jnt_bodyid[i]]) for i in range(model.njnt) if _drive_of(model, i)}
+    moved = {int(model.body_rootid[model.jnt_bodyid[i]]) for i in range(model.njnt) if read_drive(model, i)}
     bases = [body for body in free if int(model.body_rootid[body]) in moved]
     if len(bases) != 1:
         names = ", ".join(model.body(body).name for body in bases)
         line = f"several bodies with legs move freely ({names})" if bases else "no hinge or slide has an actuator"
         raise OptionError([f"env.robot: {line}; expected one robot whose legs have motors or position servos"])
     return bases[0]
-
-
-def _drive_of(model, joint: int):
-    import mujoco
-
-    kinds = (int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_SLIDE))
-    return read_drive(model, joint) if model.jnt_type[joint] in kinds else None
 
 
 def _list_colliding(model, base: int) -> list[int]:
@@ -240,7 +223,7 @@ def _find_feet(model, data, base: int) -> dict[int, list[int]]:
         lowest[body] = min(height, lowest.get(body, np.inf))
     standing = [body for body, height in lowest.items() if height < min(lowest.values()) + STANDING]
     for body in standing:
-        if not any(_drive_of(model, joint) for joint in find_path(model, body)):
+        if not any(read_drive(model, joint) for joint in find_path(model, body)):
             line = f"in the keyframe the robot lies on body '{model.body(body).name}', which no actuator moves"
             raise OptionError([f"env.robot: {line}; the keyframe must have it on its feet: {KEYFRAME}"])
     return {
@@ -251,22 +234,17 @@ def _find_feet(model, data, base: int) -> dict[int, list[int]]:
 
 def _find_joints(model, feet: dict[int, list[int]]) -> tuple[ArmJoint, ...]:
     """The joints with actuators between the base and the feet, in the order of the model."""
-    joints = {joint for body in feet for joint in find_path(model, body) if _drive_of(model, joint)}
+    joints = {joint for body in feet for joint in find_path(model, body) if read_drive(model, joint)}
     return tuple(_read_joint(model, joint) for joint in sorted(joints))
 
 
 def _read_joint(model, joint: int) -> ArmJoint:
-    import mujoco
-
-    drive, name = read_drive(model, joint), model.joint(joint).name
+    drive = read_drive(model, joint)
     assert drive is not None
     if drive.kind not in ("motor", "position"):
-        line = f"actuator '{model.actuator(drive.actuator).name}' of joint '{name}'"
+        line = f"actuator '{model.actuator(drive.actuator).name}' of joint '{model.joint(joint).name}'"
         raise OptionError([f"env.robot: {line} is neither a motor nor a position servo; legs are moved by these"])
-    low, high = model.jnt_range[joint] if model.jnt_limited[joint] else (-np.inf, np.inf)
-    is_slide = bool(model.jnt_type[joint] == int(mujoco.mjtJoint.mjJNT_SLIDE))
-    places = int(model.jnt_qposadr[joint]), int(model.jnt_dofadr[joint])
-    return ArmJoint(name, *places, is_slide, float(low), float(high), drive)
+    return make_joint(model, joint, drive)
 
 
 def _change_servo(spec, model, joint: ArmJoint, options: LegOptions) -> None:
@@ -280,11 +258,7 @@ def _change_servo(spec, model, joint: ArmJoint, options: LegOptions) -> None:
     stiffness, damping = _find_gains(joint)
     stiffness = stiffness if options.stiffness is None else options.stiffness
     damping = damping if options.damping is None else options.damping
-    actuator.set_to_position(kp=stiffness / drive.gear**2, kv=damping / drive.gear**2)
-    actuator.ctrllimited = False
-    force = np.sort(np.array(drive.torque) / drive.gear)
-    if np.isfinite(force).all():
-        actuator.forcelimited, actuator.forcerange = True, force
+    change_servo(actuator, drive, stiffness, damping)
     if spec.option.integrator == mujoco.mjtIntegrator.mjINT_EULER:  # it is not stable with much damping of servos
         spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
 
@@ -294,10 +268,7 @@ def _find_gains(joint: ArmJoint) -> tuple[float, float]:
     drive = joint.drive
     if drive.kind == "position":
         return -drive.bias[1] * drive.gear**2, -drive.bias[2] * drive.gear**2
-    low, high = drive.torque
-    if not low < 0 < high or not np.isfinite(low + high):
-        line = f"the torque of joint '{joint.name}' is not limited on both sides ({low:g} to {high:g})"
-        raise OptionError([f'env.robot: {line}; give its motor a range, such as ctrlrange="-10 10"'])
+    low, high = check_torque(drive, f"joint '{joint.name}'", MOTOR_ADVICE)
     stiffness = STIFFNESS * min(-low, high)
     return stiffness, DAMPING * stiffness
 

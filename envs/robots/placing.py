@@ -49,7 +49,7 @@ def put(arm: Arm, place: np.ndarray, start: np.ndarray) -> Placed:
     import mujoco
 
     model, data = arm.model, mujoco.MjData(arm.model)
-    places, dofs = (np.array([getattr(joint, name) for joint in arm.joints]) for name in ("qpos", "dof"))
+    places, dofs = arm.qpos_of, arm.dof_of
     site, (low, high) = model.site(arm.site).id, arm.ranges
     body = int(model.site_bodyid[site])
     jacobian, turning = np.empty((3, model.nv)), np.empty((3, model.nv))

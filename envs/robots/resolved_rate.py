@@ -65,7 +65,7 @@ def make_resolved_rate(control: Control, speeds: np.ndarray, kind: str, dt: floa
 
 def _make_velocity(arm: Arm, speeds: np.ndarray, dt: float) -> Callable[..., tuple[jax.Array, jax.Array]]:
     """(q'* [n], J [6, n]) for a twist `[6]`, of which the rotation is left free where it does not count."""
-    places, dofs = (np.array([getattr(joint, name) for joint in arm.joints]) for name in ("qpos", "dof"))
+    places, dofs = arm.qpos_of, arm.dof_of
     low, high = arm.ranges
     jacobians = compile_forward(arm.model, outputs=(f"site_jacp[{arm.site}]", f"site_jacr[{arm.site}]"))
 
@@ -85,7 +85,7 @@ def _make_velocity(arm: Arm, speeds: np.ndarray, dt: float) -> Callable[..., tup
 
 def _make_torque(arm: Arm) -> Callable[[jax.Array, jax.Array, jax.Array], jax.Array]:
     """Tau of the arm's joints [n] for wanted velocities [n]: M(q) (q'* - q') / RESPONSE + c(q, q') - passive forces."""
-    dofs = np.array([joint.dof for joint in arm.joints])
+    dofs = arm.dof_of
     inverse = compile_inverse(arm.model)
 
     def find(qpos, qvel, velocity):

@@ -264,25 +264,21 @@ def _find_base(model) -> str:
 def _suggest_task(model) -> str:
     """The environment for a moving base: "drive" with wheels, "walk" with legs, "" with neither."""
     driven = [x for x in range(model.njnt) if find_free_joint(model, int(model.jnt_bodyid[x])) is not None]
-    limited = [bool(model.jnt_limited[x]) for x in driven if _read_drive(model, x)]
+    limited = [bool(model.jnt_limited[x]) for x in driven if read_drive(model, x)]
     if not limited:
         return ""
     return "walk" if any(limited) else "drive"
-
-
-def _read_drive(model, joint: int) -> Drive | None:
-    return read_drive(model, joint) if KINDS[model.jnt_type[joint]] in ("slide", "hinge") else None
 
 
 def _list_known(model, arm: Arm | None) -> set[int]:
     """The actuators of the arm, or without one of any joint."""
     if arm:
         return {joint.drive.actuator for joint in arm.joints}
-    return {drive.actuator for joint in range(model.njnt) if (drive := _read_drive(model, joint))}
+    return {drive.actuator for joint in range(model.njnt) if (drive := read_drive(model, joint))}
 
 
 def _read_joint(model, joint: int, arm: Arm | None) -> JointEntry:
-    name, kind, drive = model.joint(joint).name, KINDS[model.jnt_type[joint]], _read_drive(model, joint)
+    name, kind, drive = model.joint(joint).name, KINDS[model.jnt_type[joint]], read_drive(model, joint)
     low, high = model.jnt_range[joint].tolist() if model.jnt_limited[joint] else (-np.inf, np.inf)
     qpos = arm.qpos if arm else find_rest(model)[0]
     return JointEntry(

@@ -22,7 +22,7 @@ from envs.options import OptionError
 from envs.physics import change_collision, compile_model
 from envs.physics.models import model_name
 from envs.physics.pairs import colliding_pairs
-from envs.robots.drives import Drive, read_drive
+from envs.robots.drives import Drive, check_torque, make_writer, read_drive
 
 if TYPE_CHECKING:
     import mujoco
@@ -219,15 +219,9 @@ def make_wheel_control(
 
 def _make_command(robot: WheeledRobot, limits: np.ndarray) -> Callable[[jax.Array], jax.Array]:
     """Turns actions `[2]` into the controls of all actuators `[nu]`; those of no wheel keep theirs."""
-    drives, signs = [wheel.drive for wheel in robot.wheels], np.array([wheel.sign for wheel in robot.wheels])
-    offset = np.array([drive.control_of(0.0) for drive in drives])
-    scale = signs * limits * (np.array([drive.control_of(1.0) for drive in drives]) - offset)
-    numbers, rest = np.array([drive.actuator for drive in drives]), jnp.asarray(robot.ctrl, float)
-
-    def command(action):
-        return rest.at[numbers].set(scale * action + offset)
-
-    return command
+    scale = limits * np.array([wheel.sign for wheel in robot.wheels])
+    write = make_writer([wheel.drive for wheel in robot.wheels], robot.ctrl)
+    return lambda action: write(jnp.asarray(scale) * action)
 
 
 def _change_actuator(spec, robot: WheeledRobot, wheel: Wheel, control: str) -> None:
@@ -251,10 +245,8 @@ def find_rolling_inertia(robot: WheeledRobot) -> np.ndarray:
 
 
 def _find_torque(wheel: Wheel) -> float:
-    low, high = wheel.drive.torque
-    if not low < 0 < high or not np.isfinite(low + high):
-        line = f"the torque of wheel '{wheel.name}' is not limited on both sides ({low:g} to {high:g})"
-        raise OptionError([f'env.robot: {line}; give its actuator a range, such as forcerange="-1 1"'])
+    advice = 'give its actuator a range, such as forcerange="-1 1"'
+    low, high = check_torque(wheel.drive, f"wheel '{wheel.name}'", advice)
     return min(-low, high)
 
 
